@@ -191,7 +191,6 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
   if (dot(out, wide) < T(0) && norm(wide) > T(kDensityClear)) out = T(-1) * out;
   const T *s = a.scales + 3 * i, shortest = min(s[0], min(s[1], s[2]));
   const T middle = s[0] + s[1] + s[2] - shortest - max(s[0], max(s[1], s[2]));
-  T least = T(kDensityAway);  // cosine to the eye below which it is seen from its other side
   Mat3<T> axes;
   if (shortest < T(kFlatSplat) * middle && rotation_from_quat(a.quats + 4 * i, &axes)) {
     // Which column, without an index that changes: that would put the matrix into local memory.
@@ -205,12 +204,12 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
     } else if (fabs(agreement) > T(0.5) * clear - T(kDensityUnclear)) {
       // Across a clear gradient it would be a splat standing on edge (hair, seams).
       out = side * axis;
-      least = T(0);
     }
   }
   if (a.eye) {
     const Vec3<T> view{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]};
-    if (dot(out, view) < least * norm(out) * norm(view)) out = T(-1) * out;
+    // Seen edge on, the eye tells no side, and another one for every splat.
+    if (dot(out, view) < T(kDensityAway) * norm(out) * norm(view)) out = T(-1) * out;
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

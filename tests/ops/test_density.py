@@ -124,6 +124,25 @@ def test_normals_of_a_ball_point_outward() -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_a_sheet_seen_edge_on_has_one_side(device: str) -> None:
+    """A rough film on something, seen along it: no splat of it may face down, unlit."""
+    g = torch.Generator().manual_seed(5)
+    means = 2.0 * torch.rand(400, 3, generator=g, dtype=torch.float64) - 1.0
+    tilt = 0.2 * torch.rand(400, 2, generator=g, dtype=torch.float64) - 0.1
+    quats = torch.cat([torch.ones_like(tilt[:, :1]), tilt, torch.zeros_like(tilt[:, :1])], dim=1)
+    scales = torch.tensor([0.04, 0.04, 0.01], dtype=torch.float64).repeat(400, 1)
+    values = torch.zeros(sum((NODES >> level) ** 3 for level in range(reference.LEVELS)))
+    ramp = 0.5 - 0.01 * torch.arange(NODES)
+    values[: NODES**3] = ramp[:, None, None].expand(NODES, NODES, NODES).flatten()
+    eye = torch.tensor([30.0, 0.0, 0.2], dtype=torch.float64)
+    given = [t.to(device) for t in (means, quats, scales, values.double(), frame())]
+    seen = density_normals(*given, NODES, eye=eye.to(device)).cpu()
+    assert float(seen[:, 2].min()) > 0.8
+    across = ((eye - means) * seen).sum(dim=1) < 0.0
+    assert 0.2 < float(across.double().mean()) < 0.8  # the eye alone would tell half of them apart
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 3e38])
 def test_bad_numbers_stay_in_their_memory(device: str, bad: float) -> None:
     means, quats, scales = (t.float().to(device) for t in splats(500))

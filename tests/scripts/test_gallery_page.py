@@ -87,3 +87,14 @@ def test_the_page_is_written_from_the_lines_alone(
     assert gallery.main() == 0
     text = page.read_text()
     assert "old" not in text and "24 s (fill 3, simulate 20; preview)" in text
+
+
+@pytest.mark.parametrize("name", ["bread_torn", "cake_cut"])
+def test_hands_that_nobody_sees_lift_nothing(name: str) -> None:
+    """What they hold would hover; it is drawn and turned on the floor that it stands on."""
+    hands = [c for c in load_shot(ROOT / "examples" / f"{name}.yaml").colliders if not c.shown]
+    assert hands
+    for hand in hands:
+        assert hand.velocity[2] == 0.0
+        # turned over, it is turned about a point of the floor
+        assert hand.spin[:2] == (0.0, 0.0) or hand.at[2] == 0.0

@@ -116,5 +116,5 @@ def density_normals(
     if eye is None:
         return outward
     view = eye - means
-    least = torch.where(alone, 0.0, AWAY).to(axis) * outward.norm(dim=-1) * view.norm(dim=-1)
+    least = AWAY * outward.norm(dim=-1) * view.norm(dim=-1)
     return torch.where(((outward * view).sum(-1) < least)[:, None], -outward, outward)

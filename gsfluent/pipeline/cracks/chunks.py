@@ -29,13 +29,12 @@ from gsfluent.pipeline.cracks.chunk_faces import (
     find_faces,
     wide_cuts,
 )
-from gsfluent.pipeline.cracks.cuts import cut_at, in_turns
+from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
-from gsfluent.pipeline.cracks.followers import WIDE, Followers, neighbours, turns
+from gsfluent.pipeline.cracks.followers import WIDE, Followers, chips, motions, neighbours
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
-from gsfluent.pipeline.matter.pieces import CHIP
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude
 from gsfluent.pipeline.partition.threshold import CHIP as PIECE
@@ -54,6 +53,8 @@ STRAY, BAND = 1.0, 4.0
 as well; asked of points that lay so many spacings from those, the width of a crack band."""
 LUMP = 64
 """Points of one piece that hang together, below which they are crumbs as well."""
+PART = 3
+"""Points of a piece in a region for which that is divided; a chip may lie across two."""
 MOST = 32_000
 """Pieces that a region is split into at once, at most."""
 _NUMBERS = 1 << 54  # ids of face elements begin here, beyond those of births
@@ -217,7 +218,7 @@ class Chunks:
                 self._chunk[counted] * (count + 1) + label[counted], return_counts=True
             )
             chunk, piece = pair // (count + 1), pair % (count + 1)
-            enough = (many >= CHIP) | (piece == count)
+            enough = (many >= PART) | (piece == count)
             times = torch.bincount(chunk[enough], minlength=self._regions)
             size, dusty = (torch.zeros_like(times) for _ in range(2))
             size.index_add_(0, chunk, many)
@@ -461,18 +462,26 @@ class Chunks:
         chunk = points.fragments.clone()
         chunk[:count] = torch.where(self._may, self._chunk.to(chunk.dtype), chunk[:count])
         position = points.position
-        shapeless = (broken | loose)[:, None, None]
         drive = self._drives & self._may
-        turn = turns(
+        rigid = motions(
             self._chunk[drive], self._regions, self.base.matter.rest[drive],
             position[:count][drive], self.base.links.spacing[drive],
-        )[self._chunk].to(points.map)  # fmt: skip
+        )  # fmt: skip
+        turn = rigid.turn[self._chunk].to(points.map)
+        bodies = len(self._scene.bodies)
+        small = chips(self._chunk, self._may & ~self._gone, drive, self._regions, bodies)
+        chip = self._may & small[self._chunk]
+        shapeless = (broken | loose | chip)[:, None, None]
         moved, rotation = points.map.clone(), points.rotation.clone()
         moved[:count] = torch.where(shapeless, turn, moved[:count])
         rotation[:count] = torch.where(shapeless, turn, rotation[:count])
         self._crumb = self._crumb | self._crumbs(position, chunk, points.broken)
         self._crumb = self._crumb | self._strayed(position, moved, broken)
         position = self._led(position, moved)
+        rows = chip.nonzero()[:, 0]
+        if rows.numel():
+            place = rigid.placed(self._chunk[rows], self.base.matter.rest[rows])
+            position = position.index_copy(0, rows, place.to(position))
         return points._replace(position=position, fragments=chunk, map=moved, rotation=rotation)
 
     def _crumbs(self, position: Tensor, chunk: Tensor, broken: Tensor) -> Tensor:
@@ -547,19 +556,10 @@ class Chunks:
             open_ = (share > 0.0).nonzero()[:, 0]
             for turn in in_turns(rows[open_]):
                 which = open_[turn]
-                rows, part, normal = cuts.splat[which], share[which, None], cuts.normal[which]
-                root = geometry.quaternion_to_matrix(quats[rows]) * scales[rows, None]
-                before, mean = root @ root.mT, means[rows]
-                moved = ((mean - whole[rows]) * normal).sum(dim=1)
-                cut, covariance = cut_at(mean, before, normal, cuts.distance[which] - moved)
-                mean = mean + part * (cut - mean)
-                covariance = before + part[..., None] * (covariance - before)
-                turned = ops.covariance_axes(geometry.pack_symmetric(covariance))
-                means = means.index_copy(0, rows, mean)
-                quats, scales = (
-                    old.index_copy(0, rows, new)
-                    for old, new in zip((quats, scales), turned, strict=True)
-                )
+                means, quats, scales = cut_in_part(
+                    (means, quats, scales), whole, cuts.splat[which], cuts.normal[which],
+                    cuts.distance[which], share[which, None],
+                )  # fmt: skip
         rest = rest.replace(means=means, quats=quats, scales=scales)
         if self._dust.rows.numel() == 0:
             return rest

@@ -106,6 +106,35 @@ def cut_splats(
     return rows, mean, new_quats, new_scales
 
 
+def cut_in_part(
+    splats: tuple[Tensor, Tensor, Tensor], whole: Tensor, rows: Tensor, normal: Tensor,
+    distance: Tensor, share: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Means, quaternions and scales of splats of which some are cut, each once, by a share.
+
+    Args:
+        splats: All, as earlier cuts left them.
+        whole: Means of the uncut ones [m], [N, 3].
+        rows: Splats that are cut, int64 [M]; none twice.
+        normal: Unit normals of the faces, outward, [M, 3].
+        distance: Of the uncut means from the faces [m], [M].
+        share: How far they are cut, 0 to 1, [M, 1].
+    """
+    means, quats, scales = splats
+    root = geometry.quaternion_to_matrix(quats[rows]) * scales[rows, None]
+    before, mean = root @ root.mT, means[rows]
+    moved = ((mean - whole[rows]) * normal).sum(dim=1)
+    cut, covariance = cut_at(mean, before, normal, distance - moved)
+    mean = mean + share * (cut - mean)
+    covariance = before + share[..., None] * (covariance - before)
+    turned = ops.covariance_axes(geometry.pack_symmetric(covariance))
+    means = means.index_copy(0, rows, mean)
+    quats, scales = (
+        old.index_copy(0, rows, new) for old, new in zip((quats, scales), turned, strict=True)
+    )
+    return means, quats, scales
+
+
 def in_turns(rows: Tensor) -> list[Tensor]:
     """Places in a list of rows, int64 [M]: where each row comes first, where it comes next, ..."""
     ordered, order = rows.sort(stable=True)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.pipeline.matter.links import PARTED, Links
+from gsfluent.pipeline.partition.threshold import CHIP
 from gsfluent.spatial.neighbours import nearest_in_group
 
 WIDE = 1.5
@@ -83,8 +84,47 @@ def neighbours(links: Links, chunk: Tensor, rows: Tensor, among: Tensor) -> tupl
     return near, lone
 
 
-def turns(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor) -> Tensor:
-    """Rotations of chunks: the best fit (Kabsch 1976), [count, 3, 3].
+def chips(chunk: Tensor, there: Tensor, drive: Tensor, count: int, first: int) -> Tensor:
+    """Chunks that are chips which something drives, bool [count].
+
+    A chip is too small to say how it bends, and the points of one would be seen as beads: it keeps
+    its shape and goes where they go.
+
+    Args:
+        chunk: Of each point, int64 [N].
+        there: Points that are not dust, bool [N].
+        drive: Those that carry their chunk, bool [N].
+        count: Number of chunks.
+        first: Chunks below this are whole bodies, however small.
+    """
+    chip = torch.bincount(chunk[there], minlength=count) < CHIP
+    chip[:first] = False
+    driven = torch.zeros_like(chip)
+    driven[chunk[drive]] = True
+    return chip & driven
+
+
+class Motions(NamedTuple):
+    """Rigid motions of chunks.
+
+    Attributes:
+        turn: Rotations, [C, 3, 3].
+        rest: Means of their points at rest [m], float64 [C, 3].
+        now: The same now.
+    """
+
+    turn: Tensor
+    rest: Tensor
+    now: Tensor
+
+    def placed(self, chunk: Tensor, rest: Tensor) -> Tensor:
+        """Where places [m], [M, 3], of these chunks, int64 [M], are now [m], float64 [M, 3]."""
+        arm = rest.double() - self.rest[chunk]
+        return self.now[chunk] + (self.turn[chunk].double() @ arm[..., None])[..., 0]
+
+
+def motions(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor) -> Motions:
+    """Rigid motions of chunks: the best fit (Kabsch 1976).
 
     Sums go in whole numbers, which have no order.
 
@@ -93,18 +133,20 @@ def turns(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor)
         count: Number of chunks.
         rest: Where the points were at rest [m], [D, 3].
         now: Where they are [m], [D, 3].
-        spacing: Between them [m], [D].
+        spacing: Between them [m], [D]; one value for a chunk.
     """
     scale = spacing.double()[:, None]
+    edge = scale.new_zeros(count, 1).index_copy(0, chunk, scale)
     many = torch.bincount(chunk, minlength=count).clamp(min=1).double()[:, None]
-    arms = []
+    arms, centers = [], []
     for place in (rest.double(), now.double()):
         whole = (place / scale * _FINE).round().long()
         total = whole.new_zeros(count, 3).index_add_(0, chunk, whole)
         center = total.double() / (_FINE * many)
         arms.append(place / scale - center[chunk])
+        centers.append(center * edge)
     square = (arms[1][:, :, None] * arms[0][:, None] * _FINE).round().long()
     total = square.new_zeros(count, 3, 3).index_add_(0, chunk, square)
     size = total.double().abs().amax(dim=(1, 2), keepdim=True).clamp(min=1.0)
     turn, _ = ops.polar_clamped((total.double() / size).contiguous(), 0.3, 2.0)
-    return turn
+    return Motions(turn, *centers)

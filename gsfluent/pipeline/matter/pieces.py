@@ -24,8 +24,9 @@ from gsfluent.spatial.neighbours import nearest_rows
 
 LEAST = 64
 """Points of a seed: 8 cells, less has no node of the grid to itself."""
-CHIP = 3
-"""Points of the smallest chip."""
+CHIP = 8
+"""Points of the smallest chip: a cell of them. Less has no shape on this grid and is drawn as a
+pebble; it is dust, which has grains by the law of sizes, or joins its piece."""
 OPEN = 1.5
 """Ratio of a link's length to that at rest from which it is cut when an end of it is broken."""
 TORN = 2.0

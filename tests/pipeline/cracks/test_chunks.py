@@ -70,6 +70,30 @@ def picture(gaussians: Gaussians, eye: tuple[float, float, float] = (0.1, -0.3, 
     )
 
 
+def test_a_chip_keeps_its_shape_where_its_points_run_apart(bound: Carry) -> None:
+    """Drawn around its points one by one, it would be a heap of beads."""
+    rest, spacing = bound.matter.rest, bound.matter.spacing[0]
+    tip = rest[rest[:, 2].argmax()]
+    chip = (rest - tip).norm(dim=1).argsort()[:20]
+    unit = torch.zeros(len(rest), dtype=torch.int64)
+    unit[chip] = int(chip.min()) or 1
+    middle = rest[chip].mean(dim=0)
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).to(rest)
+    away = torch.tensor([2.0, 0.0, 1.0]).to(rest)
+    found = []
+    for spread in (1.0, 2.0):
+        moved = torch.zeros_like(rest)
+        moved[chip] = middle + away + spread * (rest[chip] - middle) @ turn.T - rest[chip]
+        points = moment(bound, unit, moved)
+        fragments = points.fragments.clone()
+        fragments[chip] = -1
+        found.append(drawn(bound, Repair().begin(bound), points._replace(fragments=fragments)))
+    whole, scattered = (done.gaussians.means for done in found)
+    flown = whole[:, 0] > 1.0
+    assert int(flown.sum()) > 20
+    assert float((whole - scattered)[flown].norm(dim=1).max()) < 1e-3 * spacing
+
+
 @pytest.mark.parametrize("bent", [0.0, 0.3])
 def test_a_split_alone_changes_no_picture(bound: Carry, bent: float) -> None:
     """The same motion, before and after what hung together is seen to be two pieces."""

@@ -106,19 +106,18 @@ def test_a_cut_outlives_its_cause() -> None:
 
 
 def test_what_nothing_reaches_is_chip_or_dust_by_its_size() -> None:
-    web = rope(40)
+    web = rope(48)
     position = web.rest.double().clone()
-    # Twenty stay; then five, two, one and the rest fly off, each far from the others.
-    for start, shift in ((20, 40.0), (25, 90.0), (27, 140.0), (28, 190.0)):
+    # Twenty stay; then eight, a cell of them, seven, one and the rest fly off, each far away.
+    for start, shift in ((20, 40.0), (28, 90.0), (35, 140.0), (36, 190.0)):
         position[start:, 1] += shift
     pieces = look(web, [], position, least=12)
     labels = pieces.fragments.labels.tolist()
-    assert labels == [0] * 20 + [-1] * 8 + [28] * 12
-    assert pieces.chip.nonzero()[:, 0].tolist() == list(range(20, 25))
-    assert pieces.unit[20:25].tolist() == [20] * 5
-    assert (
-        pieces.dust.nonzero()[:, 0].tolist() == [25, 26, 27] and not pieces.unit[25:28].ge(0).any()
-    )
+    assert labels == [0] * 20 + [-1] * 16 + [36] * 12
+    assert pieces.chip.nonzero()[:, 0].tolist() == list(range(20, 28))
+    assert pieces.unit[20:28].tolist() == [20] * 8
+    assert pieces.dust.nonzero()[:, 0].tolist() == list(range(28, 36))
+    assert not pieces.unit[28:36].ge(0).any()
 
 
 def test_bits_that_move_with_their_piece_belong_to_it() -> None:
