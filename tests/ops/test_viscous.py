@@ -350,11 +350,15 @@ def test_branches_that_are_none_are_refused() -> None:
 
 
 @pytest.mark.cuda
-def test_a_gpu_steps_by_the_operators() -> None:
+def test_the_solver_of_a_gpu_names_the_operators() -> None:
     cube = {k: v.cuda() for k, v in ball(torch.float32, NACC).items()}
     n = cube["position"].shape[0]
-    with pytest.raises(InputError, match="relax"):
+    with pytest.raises(InputError, match="viscous_step"):
         ops.Solver(**cube, dx=DX, viscous=branch(0.5, 1.0, n).float().cuda())
+
+
+@pytest.mark.cuda
+def test_a_gpu_steps_by_the_operators() -> None:
     strain, spring, move = some(5, 64, 0.02)
     viscous = branch(0.7, 50.0, 64)
     viscous[:, :6] = spring

@@ -23,7 +23,7 @@ def test_a_kill_is_counted_and_loses_nothing() -> None:
 
 
 def test_what_is_put_among_the_finished_is_found_there(tmp_path: Path) -> None:
-    resume = load_script("bench/sweep_resume")
+    resume = load_script("bench/sweep/resume")
     file = resume.sweep_file(tmp_path, 5)
     assert resume.finish(file, tmp_path / "out") == 5
     said = run_sweep(
@@ -34,7 +34,7 @@ def test_what_is_put_among_the_finished_is_found_there(tmp_path: Path) -> None:
 
 
 def test_packed_shots_are_those_one_after_another(tmp_path: Path) -> None:
-    packing = load_script("bench/packing")
+    packing = load_script("bench/sweep/packing")
     sweeps = [
         read_sweep(packing.sweep_file(tmp_path, [0, 1], 0.1, pack, "cuda"), {}, None)
         for pack in (1, 4)

@@ -232,7 +232,7 @@ class Partition:
         high = torch.tensor(shape, device=place.device) - 1 + radius
         near = ((local > -radius) & (local < high)).all(dim=1)
         domain = self.region[span] == region
-        nearest = ops.nearest_labels(local[near], piece[near], shape, radius)
+        nearest = ops.nearest_labels(local[near], piece[near].long(), shape, radius)
         lost = (domain & (nearest < 0)).nonzero()
         if len(lost):
             centers = self.center(lost + torch.tensor(low, device=lost.device))

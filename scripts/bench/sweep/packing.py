@@ -1,7 +1,7 @@
 """Small shots beside each other on one GPU, against the same shots one after the other.
 
-    python scripts/bench/packing.py [--device cuda] [--shots 8] [--pack 8] [-o OUT] [--json FILE]
-    python scripts/bench/packing.py --page FILE.json     # enters the table into the docs
+    python scripts/bench/sweep/packing.py [--device cuda] [--shots 8] [--pack 8] [-o OUT] [--json FILE]
+    python scripts/bench/sweep/packing.py --page FILE.json     # enters the table into the docs
 
 A melon is filled and textured once; then the shots, which differ in their seed, go through
 gsfluent.sweep twice, one at a time and --pack at a time. Time counts from the first to the last
@@ -31,7 +31,7 @@ from gsfluent.progress import LineReporter
 from gsfluent.sweep import read_sweep, run_sweep
 from gsfluent.sweep.folder import SweepFolder
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "measured" / "sweeps.md"
 WARM = 1000
 """Seed of the shot that makes the solids and loads the kernels."""
@@ -138,7 +138,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.page is not None:
         row = json.loads(options.page.read_text())
-        PAGE.write_text(enter(PAGE.read_text(), "packing", row["device"], markdown(row)))
+        PAGE.write_text(enter(PAGE.read_text(), "packing", markdown(row)))
         return
     row = measure(options)
     if options.json is not None:

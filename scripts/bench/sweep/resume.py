@@ -1,6 +1,6 @@
 """What a sweep costs that is taken up again when all of it is done.
 
-    python scripts/bench/sweep_resume.py [--shots 10000] [--json FILE] [--page]
+    python scripts/bench/sweep/resume.py [--shots 10000] [--json FILE] [--page]
 
 Shots are put among the finished without being run, each with a row as one that ran; then
 `gsfluent sweep` is called twice, as somebody does who wants the rest of a sweep. The second call
@@ -31,7 +31,7 @@ from gsfluent.sweep import read_sweep
 from gsfluent.sweep.folder import ROW, SweepFolder
 from gsfluent.sweep.tasks import tasks_of
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "measured" / "sweeps.md"
 FIGURES = ("frames", "substeps", "particles", "pieces", "fragments", "kinetic", "dissipated")
 
