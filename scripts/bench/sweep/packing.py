@@ -1,6 +1,6 @@
 """Small shots beside each other on one GPU, against the same shots one after the other.
 
-    python scripts/bench/sweep/packing.py [--device cuda] [--shots 8] [--pack 8] [-o OUT] [--json FILE]
+    python scripts/bench/sweep/packing.py [--device cuda] [--shots 8] [--pack 8] [--json FILE]
     python scripts/bench/sweep/packing.py --page FILE.json     # enters the table into the docs
 
 A melon is filled and textured once; then the shots, which differ in their seed, go through
