@@ -146,7 +146,7 @@ def run_in(
         return left()
 
     try:
-        check_shot(shot)
+        check_shot(shot, device)
         with (
             heard_warnings("gsfluent") as heard,
             heartbeat("gsfluent", at_work, adds=progressed) as watched,

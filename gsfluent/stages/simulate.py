@@ -107,7 +107,8 @@ def moving_settings(shot: Shot) -> list[Any]:
         [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        [shot.solve.standing],
+        # as it was before there was a choice, where none is made
+        [shot.solve.standing, *([shot.solve.contact] if shot.solve.contact != "nodes" else [])],
         shot.output.fps,
         shot.output.seconds,
     ]
@@ -120,6 +121,7 @@ def solver_options(shot: Shot) -> SolverOptions:
         cfl=solve.cfl,
         standing=solve.standing,
         deterministic=solve.deterministic,
+        surface=solve.contact == "points",
     )
 
 

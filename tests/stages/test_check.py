@@ -14,6 +14,7 @@ from gsfluent.errors import InputError
 from gsfluent.io import save_splats
 from gsfluent.run.shot import run_shot
 from gsfluent.stages.check import check_shot
+from gsfluent.stages.simulate import moving_settings, solver_options
 
 BLADE = {"type": "blade", "path": [[0, 0, 1], [0, 0, 0]], "width": 0.3}
 
@@ -68,4 +69,15 @@ def test_it_is_refused_before_any_work(
     ],
 )  # fmt: skip
 def test_what_can_be_passes(splats: Path, changes: dict[str, Any]) -> None:
-    check_shot(shot(splats, **changes))
+    check_shot(shot(splats, **changes), torch.device("cpu"))
+
+
+def test_points_are_pushed_where_they_can_be(splats: Path) -> None:
+    pushed = shot(splats, solve={"contact": "points"})
+    assert solver_options(pushed).surface and not solver_options(shot(splats)).surface
+    assert moving_settings(pushed) != moving_settings(shot(splats))
+    check_shot(pushed, torch.device("cpu"))
+    with pytest.raises(InputError, match="not pushed on cuda"):
+        check_shot(pushed, torch.device("cuda"))
+    with pytest.raises(InputError, match="cfl must be at most"):
+        check_shot(shot(splats, solve={"contact": "points", "cfl": 0.8}), torch.device("cpu"))
