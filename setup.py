@@ -139,12 +139,26 @@ def core_extension() -> list:
     ]
 
 
+def remove_stale(objects: Path, headers: list[Path]) -> None:
+    """Remove what was compiled before a header changed.
+
+    torch tells ninja the headers of a .cu file on machines with a CUDA torch only: a cross build
+    would link kernels that know an older layout of the same struct.
+    """
+    newest = max((header.stat().st_mtime for header in headers), default=0.0)
+    for compiled in objects.rglob("*.o"):
+        if compiled.stat().st_mtime < newest:
+            compiled.unlink()
+
+
 class BuildExtension(cpp_extension.BuildExtension):
     """torch's, which leaves `_core` out of everything but checkouts."""
 
     def run(self) -> None:
         if CORE == "auto" and not (self.inplace or self.editable_mode):
             self.extensions = [e for e in self.extensions if e.name != "gsfluent._core"]
+        if torch.version.cuda is None:
+            remove_stale(Path(self.build_temp) / "csrc/cuda", list((ROOT / "csrc").rglob("*.h")))
         super().run()
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import runpy
 from pathlib import Path
 
 import pytest
@@ -66,3 +68,16 @@ def test_digests_that_wheels_are_compared_by_see_a_last_bit() -> None:
     before = bits.digest(one)
     one[1][0, 0] = torch.nextafter(one[1][0, 0], torch.tensor(9.0))
     assert bits.digest(one) != before
+
+
+def test_kernels_are_compiled_anew_when_a_header_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("setuptools.setup", lambda **settings: None)
+    build = runpy.run_path(str(Path(__file__).resolve().parents[1] / "setup.py"))
+    for name, when in (("solver/step.o", 100), ("solver/new.o", 300), ("state.h", 200)):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (when, when))
+    build["remove_stale"](tmp_path, [tmp_path / "state.h"])
+    assert [path.name for path in tmp_path.rglob("*.o")] == ["new.o"]
