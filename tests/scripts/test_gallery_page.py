@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from loaded_scripts import load_script
 
-from gsfluent.config import load_shot
+from gsfluent.config import Shot, load_shot
 from gsfluent.demo.catalogue import OBJECTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,6 +26,21 @@ def line(**keys: Any) -> dict[str, Any]:
     return made | keys
 
 
+def shot_of(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Shot:
+    """The shot of a scene; files that it names need not be there for it to be read."""
+    text = (ROOT / "examples" / f"{name}.yaml").read_text(encoding="utf-8")
+    monkeypatch.setenv("GSFLUENT_DATA", str(folder))
+    for word in text.replace(",", " ").replace("}", " ").split():
+        path = word.removeprefix("$GSFLUENT_DATA/")
+        if "/" in path and path.startswith(
+            ("data/", "captures/", "exemplars/", "cameras/", "meshes/")
+        ):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).touch()
+    (folder / "shot.yaml").write_text(text, encoding="utf-8")
+    return load_shot(folder / "shot.yaml")
+
+
 @pytest.mark.parametrize("name", gallery.SCENES)
 def test_every_scene_has_a_shot_that_reads(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -35,17 +50,7 @@ def test_every_scene_has_a_shot_that_reads(
     assert not drawn or drawn in OBJECTS
     assert f"gsfluent run examples/{name}.yaml" in text
     assert not drawn or f"gsfluent demo {drawn} --photographs examples/data/{drawn}" in text
-    # files that the shot names need not be there for it to be read
-    monkeypatch.setenv("GSFLUENT_DATA", str(tmp_path))
-    for word in text.replace(",", " ").replace("}", " ").split():
-        path = word.removeprefix("$GSFLUENT_DATA/")
-        if "/" in path and path.startswith(
-            ("data/", "captures/", "exemplars/", "cameras/", "meshes/")
-        ):
-            (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / path).touch()
-    (tmp_path / "shot.yaml").write_text(text, encoding="utf-8")
-    shot = load_shot(tmp_path / "shot.yaml")
+    shot = shot_of(name, tmp_path, monkeypatch)
     assert 1.0 <= shot.output.seconds * shot.output.slow <= 4.0  # what one watches
 
 
@@ -90,9 +95,11 @@ def test_the_page_is_written_from_the_lines_alone(
 
 
 @pytest.mark.parametrize("name", ["bread_torn", "cake_cut"])
-def test_hands_that_nobody_sees_lift_nothing(name: str) -> None:
+def test_hands_that_nobody_sees_lift_nothing(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What they hold would hover; it is drawn and turned on the floor that it stands on."""
-    hands = [c for c in load_shot(ROOT / "examples" / f"{name}.yaml").colliders if not c.shown]
+    hands = [c for c in shot_of(name, tmp_path, monkeypatch).colliders if not c.shown]
     assert hands
     for hand in hands:
         assert hand.velocity[2] == 0.0
