@@ -282,12 +282,9 @@ class Solver(SolverState):
                     f"{op}: objects push each other's points by their radius, which is missing",
                     hint="give radius too, or leave out objects: fields then touch at nodes",
                 )
-            rows = check_tensor(op, "objects", objects, shape=(self.fields,), dtype=torch.int32)
-            b.object = rows.to(self.device).contiguous()
+            b.object = self._per_field("objects", objects)
         if parent is not None or cut is not None:
-            for name, given in (("parent", parent), ("cut", cut)):
-                rows = check_tensor(op, name, given, shape=(self.fields,), dtype=torch.int32)
-                setattr(b, name, rows.to(self.device).contiguous())
+            b.parent, b.cut = self._per_field("parent", parent), self._per_field("cut", cut)
         heaviest = float(mass.max())
         bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
         self._write(
@@ -295,6 +292,11 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
+
+    def _per_field(self, name: str, given: Tensor | None) -> Tensor:
+        """A whole number of each field, checked, where the state is."""
+        rows = check_tensor("Solver", name, given, shape=(self.fields,), dtype=torch.int32)
+        return rows.to(self.device).contiguous()
 
     def _thickens(self, viscous: Tensor | None, like: Tensor, laws: set[int]) -> None:
         """Choose the kernel of viscous solids; refuse what it does not know."""

@@ -71,8 +71,7 @@ def divide_wide(splats: Gaussians, widest: float) -> Gaussians:
 
 def _parts(wide: Gaussians, counts: Tensor) -> Gaussians:
     """Wide splats [M] as lattices of ``counts`` [3] narrower ones to each side."""
-    ratio = torch.where(counts > 0, STEP * (counts + 0.5) / _REACH, 1.0)  # of the deviations
-    lattice, table = _table(tuple(counts.tolist()), ratio.device)
+    ratio, lattice, table = _table(tuple(counts.tolist()), counts.device)
     row = wide.opacities.clamp(0.0, _OPAQUE) / _OPAQUE * (_OPACITIES - 1)
     low = row.long().clamp(max=_OPACITIES - 2)
     opacity = torch.lerp(table[low], table[low + 1], (row - low)[:, None])
@@ -88,14 +87,19 @@ def _parts(wide: Gaussians, counts: Tensor) -> Gaussians:
 
 
 @functools.lru_cache(maxsize=64)
-def _table(counts: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Places of the parts [L, 3], and their opacities [_OPACITIES, L] by the splat's own."""
+def _table(counts: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Splats of ``counts`` parts to each side, whatever they are.
+
+    Returns:
+        By how much parts are narrower [3], their places [L, 3], and their opacities
+        [_OPACITIES, L] by the splat's own.
+    """
     n = torch.tensor(counts, device=device)
-    ratio = torch.where(n > 0, STEP * (n + 0.5) / _REACH, 1.0)
+    ratio = torch.where(n > 0, STEP * (n + 0.5) / _REACH, 1.0)  # of the deviations
     lattice, places = (_lattice([f * m for m in counts], STEP / f, ratio) for f in (1, 2))
     known = torch.linspace(0.0, _OPAQUE, _OPACITIES, device=device)
     hidden = known[:, None] * torch.exp(-0.5 * (places / ratio).square().sum(dim=1))
-    return lattice, _opacities(-torch.log1p(-hidden), places, lattice)
+    return ratio, lattice, _opacities(-torch.log1p(-hidden), places, lattice)
 
 
 def _lattice(counts: list[int], step: float, like: Tensor) -> Tensor:

@@ -9,9 +9,11 @@ import math
 from collections.abc import Iterator
 
 import torch
+from torch import Tensor
 
 from gsfluent.lab.problems.contact.contact import SPACING, bodies, smooth_ball
 from gsfluent.lab.problems.contact.friction import PULL
+from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
 from gsfluent.lab.world.walls import wall
@@ -41,13 +43,52 @@ def bounce(
         [points], [torch.tensor([0.0, 0.0, -speed], dtype=torch.float64)], volume=volume,
         dtype=torch.float32, colliders=[wall(2, mode="separate")], surface=surface, cfl=cfl,
     )  # fmt: skip
+    mass = float(world.scene.mass.double().sum())
+    most = largest_energy(world, 1.6 / speed + 6.0 * radius * speed**-0.2)
+    up = float(world.momentum()[2])
+    return up / mass / speed, most, float(world.impulse[0, 2]) / (up + mass * speed)
+
+
+def largest_energy(world: World, span: float) -> float:
+    """Run on for a time [dx/c]; largest energy in it over that at its beginning, at least 1."""
     start, most = world.kinetic(), 1.0
-    mass, span = float(world.scene.mass.double().sum()), 1.6 / speed + 6.0 * radius * speed**-0.2
     for _ in range(12):  # few: the last step before each look is a short one
         world.run(span / 12)
         most = max(most, (world.kinetic() + world.elastic()) / start)
-    up = float(world.momentum()[2])
-    return up / mass / speed, most, float(world.impulse[0, 2]) / (up + mass * speed)
+    return most
+
+
+def watched(
+    world: World, layer: Tensor, touching: float, below: Tensor | None = None
+) -> tuple[float, str]:
+    """Run on for 200 s; mean gap under a layer of points, and how far it swung, in words.
+
+    Args:
+        world: What is at rest by and by.
+        layer: Rows of its lowest points.
+        touching: How high they are where they touch [dx].
+        below: Rows of points above whose mean that counts; above 0 when absent.
+    """
+    seen: list[float] = []
+    for _ in range(20):
+        world.run(10.0)
+        height = world.position[layer, 2].mean()
+        if below is not None:
+            height = height - world.position[below, 2].mean()
+        seen.append(float(height) - touching)
+    return sum(seen) / len(seen), f"mean of 200 s, swing {max(seen) - min(seen):.3f}"
+
+
+def bounced(radius: float, bar: float, kept: float, most: float, note: str) -> Iterator[Result]:
+    """What an elastic ball of this radius [dx] keeps, within a bar, and its largest energy."""
+    yield compare(
+        f"restitution, R = {radius:g} dx", kept, 1.0, tolerance=bar, source="elastic impact",
+        note=f"{note}; damping of the transfer (docs/theory/mpm.md)",
+    )  # fmt: skip
+    yield compare(
+        f"largest energy / first, R = {radius:g} dx", most, 1.0, tolerance=1e-5,
+        source="energy never rises",
+    )  # fmt: skip
 
 
 def rest(cells: int, *, surface: float | None = HALF) -> Iterator[Result]:
@@ -61,15 +102,11 @@ def rest(cells: int, *, surface: float | None = HALF) -> Iterator[Result]:
         )  # fmt: skip
         layer = torch.argsort(world.position[:, 2])[: (2 * cells) ** 2]
         world.run(600.0)
-        seen: list[float] = []
-        for _ in range(20):
-            world.run(10.0)
-            seen.append(float(world.position[layer, 2].mean()) - 0.5 * SPACING - shift)
-        mean = sum(seen) / len(seen)
+        mean, note = watched(world, layer, 0.5 * SPACING + shift)
         yield compare(
             f"gap under a cube of {cells} cells, floor {shift:g} dx above a node", mean,
             tolerance=0.1, unit="dx", source="touching", name="cube_on_floor",
-            note=f"mean of 200 s, swing {max(seen) - min(seen):.3f}",
+            note=note,
         )  # fmt: skip
 
 
@@ -104,14 +141,7 @@ def ball_on_floor() -> Iterator[Result]:
     """An elastic ball bounces off a rigid floor and makes no energy."""
     for radius, bar in ((6.0, 0.05), (10.0, 0.03)):
         kept, most, _ = bounce(radius)
-        yield compare(
-            f"restitution, R = {radius:g} dx", kept, 1.0, tolerance=bar, source="elastic impact",
-            note="0.05 c; damping of the transfer (docs/theory/mpm.md)",
-        )  # fmt: skip
-        yield compare(
-            f"largest energy / first, R = {radius:g} dx", most, 1.0, tolerance=1e-5,
-            source="energy never rises",
-        )  # fmt: skip
+        yield from bounced(radius, bar, kept, most, "0.05 c")
 
 
 @problem(tier="fast")
