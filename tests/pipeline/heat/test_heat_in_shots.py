@@ -97,6 +97,19 @@ def test_what_freezes_keeps_its_stress_and_energy_falls() -> None:
     assert torch.equal(hard.particles.material, run.matter.particles.material)
 
 
+def test_melt_that_has_parted_freezes_without_tension() -> None:
+    run = gf.pipeline.Simulate(dx=0.005).run_of(scene_of("wax", 80.0), 10.0)
+    state, count = run.state, run.state.particles.count
+    assert state.level is not None and int(state.level.min()) == LEVELS
+    strain = torch.zeros(count, 6)
+    strain[:, :3] = torch.linspace(-0.01, 0.1, count)[:, None]
+    state = state._replace(particles=state.particles.replace(strain=strain))
+    before = run.matter.stored(state.particles, state.peak)
+    solid = run.heat._softened(state, torch.full((count,), LEVELS - 1, dtype=torch.int8))
+    after = run.matter.stored(solid.particles, solid.peak)
+    assert bool((after <= before + 1e-12).all())
+
+
 def test_steps_are_the_solid_made_weaker_and_then_a_liquid() -> None:
     scene = scene_of("wax", 20.0)
     plain = build_matter(scene, 0.005)
