@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 import gsfluent as gf
-from gsfluent.config import Shot
+from gsfluent.config import Shot, load_shot
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.lab.problems.heat.melting import stefan_number
@@ -195,6 +196,16 @@ def test_a_shot_names_temperatures(tmp_path) -> None:  # type: ignore[no-untyped
     ):
         with pytest.raises(InputError, match=words):
             Shot.from_dict({**values, **wrong}, tmp_path)
+
+
+def test_the_example_reads(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    text = (Path(__file__).resolve().parents[3] / "examples" / "chocolate_melted.yaml").read_text()
+    (tmp_path / "data/chocolate/photographs").mkdir(parents=True)
+    (tmp_path / "data/chocolate/cut.png").touch()
+    (tmp_path / "shot.yaml").write_text(text)
+    shot = load_shot(tmp_path / "shot.yaml")
+    assert shot.objects["bar"].temperature == 24.0
+    assert shot.heat is not None and shot.heat.speed == 400.0
 
 
 @pytest.mark.cuda
