@@ -18,6 +18,7 @@ constexpr double kSteepest = 4.0;
 constexpr double kNormalOffset = 1.0;  // biases that a point is lifted off bumpy splats
 constexpr double kFade = 4.0;  // biases past the bias from which on a blocker counts in full
 constexpr double kTinyLength = 1e-12;
+constexpr int kBlockerEdge = 4;  // texels along a block of ShadeArgs::blockers
 
 // Points of Vogel's spiral over the unit disc, one after the other: turns by the golden angle.
 template <typename T>
@@ -70,6 +71,23 @@ struct ShadowView {
     return int64_t(index_within(line, 0, size - 1)) * size + index_within(column, 0, size - 1);
   }
 };
+
+GSF_HOST_DEVICE int blocker_blocks(int texels) {
+  return (texels + kBlockerEdge - 1) / kBlockerEdge;
+}
+
+// False when the map has nothing opaque within `reach` texels of a texel: one look instead of many.
+template <typename T>
+GSF_HOST_DEVICE bool may_block(const int32_t* blockers, int texels, T x, T y, T reach) {
+  const int last = texels - 1, pitch = blocker_blocks(texels) + 1;
+  const int left = index_within(x - reach, 0, last) / kBlockerEdge,
+            right = index_within(x + reach, 0, last) / kBlockerEdge + 1,
+            top = index_within(y - reach, 0, last) / kBlockerEdge * pitch,
+            bottom = (index_within(y + reach, 0, last) / kBlockerEdge + 1) * pitch;
+  return blockers[bottom + right] - blockers[bottom + left] - blockers[top + right] +
+             blockers[top + left] !=
+         0;
+}
 
 // Which of a lamp's maps looks at a point: that in which it is deepest.
 template <typename T>
@@ -128,6 +146,13 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   T search = lamp[9] * (view.depth - closest) * view.per_depth;
   if (is_point) search = search / max(closest, T(kTinyLength));
   search = clamp(search, T(kLeastSearch), most);
+#ifndef __CUDA_ARCH__
+  if (a.blockers != nullptr) {
+    const int pitch = blocker_blocks(a.texels) + 1;
+    if (!may_block(a.blockers + int64_t(face) * pitch * pitch, a.texels, view.x, view.y, search))
+      return T(1);
+  }
+#endif
   T weight = T(0), total = T(0), deepest = T(0);
   Spiral<T> spiral;
   for (int i = 0; i < kSearchTaps; ++i) {
