@@ -52,6 +52,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
       "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
       "(Tensor, Tensor, Tensor, Tensor)");
+  m.def("neo_hookean_energy(Tensor strain, Tensor params, Tensor? material) -> Tensor");
   // Gradients of strain, alpha, increment, of six material columns per particle, and 1 where they
   // were computed (laws elastic and nacc, no guard).
   m.def(

@@ -1,4 +1,5 @@
-// Checks, allocation and dtype dispatch of return_mapping, once for both back ends.
+// Checks, allocation and dtype dispatch of return_mapping and neo_hookean_energy, once for both
+// back ends.
 #pragma once
 
 #include "core/material/return_mapping.h"
@@ -69,7 +70,44 @@ struct PlasticityOps {
     return {strain_out, alpha_out, stress_out, info};
   }
 
-  static void register_all(Library& m) { GSF_IMPL(PlasticityOps, return_mapping); }
+  static Tensor neo_hookean_energy(const Tensor& strain, const Tensor& params,
+                                   const OptTensor& material) {
+    const char* op = "neo_hookean_energy";
+    check_shape(op, "strain", strain, {-1, 6});
+    const int64_t n = strain.size(0);
+    const ScalarType dtype = strain.scalar_type();
+    check_shape(op, "params", params, {-1, kParamColumns});
+    check_dtype(op, "params", params, dtype);
+    check_same_device(op, "params", params, strain);
+    const int64_t rows = params.size(0);
+    if (material) {
+      check_shape(op, "material", *material, {n});
+      check_dtype(op, "material", *material, ScalarType::Int);
+      check_same_device(op, "material", *material, strain);
+    }
+    STD_TORCH_CHECK(material || rows == 1 || rows == n, op,
+                    ": without material, params must have 1 or N rows, got ", rows);
+    const Tensor e = gsf::contiguous(strain), par = gsf::contiguous(params);
+    const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
+    Tensor energy = gsf::new_empty(e, {n}, dtype);
+    const typename Backend::Scope scope(e);
+    dispatch_floating(op, e, [&]<typename T>() {
+      if (n == 0) return;
+      const StoredEnergyArgs<T> args{.count = n,
+                                     .strain = cptr<T>(e),
+                                     .rows = rows,
+                                     .params = cptr<T>(par),
+                                     .material = mat ? cptr<int32_t>(*mat) : nullptr,
+                                     .energy = mptr<T>(energy)};
+      Backend::neo_hookean_energy(args, scope);
+    });
+    return energy;
+  }
+
+  static void register_all(Library& m) {
+    GSF_IMPL(PlasticityOps, return_mapping);
+    GSF_IMPL(PlasticityOps, neo_hookean_energy);
+  }
 };
 
 }  // namespace gsf

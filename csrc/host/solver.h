@@ -158,7 +158,7 @@ struct SolverOps {
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
         {"radius", n, 1, real, true},
-        {"viscous", device ? 0 : n, kViscousColumns, real, true},
+        {"viscous", n, kViscousColumns, real, true},
         {"object", ints[kFields], 1, i32, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {

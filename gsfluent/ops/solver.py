@@ -109,7 +109,7 @@ class Solver(SolverState):
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes. CPU only.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`); laws 0 and 1
-            only, on the CPU. Default: nothing relaxes and all yields at once, at no cost.
+            only. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
             each other (docs/theory/contact.md, "At a point"); fields of one object touch at nodes.
             Default: all fields do.
@@ -302,11 +302,6 @@ class Solver(SolverState):
         """Choose the kernel of viscous solids; refuse what it does not know."""
         if viscous is None:
             return
-        if like.device.type != "cpu":
-            raise InputError(
-                f"Solver: viscous: {like.device.type} knows no viscous solids yet",
-                hint="step them by p2g, grid_update, g2p, return_mapping and viscous_step",
-            )
         if not laws <= {ELASTIC, NACC}:
             raise InputError(
                 f"Solver: viscous works beside laws 0 and 1 (elastic, nacc) only, got "

@@ -21,7 +21,8 @@ from gsfluent.ops.viscous import viscous_step
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
 MORE_LAWS, DAMAGE_FIELD, VISCOUS = 3, 4, 5
-"""Sets of laws that have kernels on the CPU only: ``LawSet`` of ``csrc/core/solver/particle.h``."""
+"""Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``; the first two
+have kernels on the CPU only."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
 
@@ -360,7 +361,7 @@ class SolverState:
         """Viscosity of each point with its spring, [N, 9], or None without."""
         if self._buffers.viscous.numel() == 0:
             return None
-        return self._restored(self._buffers.viscous)
+        return self._restored(self._rowwise("viscous"))
 
     @property
     def stress(self) -> Tensor:
@@ -382,9 +383,9 @@ class SolverState:
             dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
         if b.viscous.numel():
-            none = strain.new_zeros(self.count, 3, 3)
+            own, none = self._rowwise("viscous"), strain.new_zeros(self.count, 3, 3)
             stress = viscous_step(
-                b.viscous, strain, alpha, none, (after, new_alpha, stress), law=b.law,
+                own, strain, alpha, none, (after, new_alpha, stress), law=b.law,
                 params=b.rows[:, :8].contiguous(), material=row, dt=0.0,
             )[3]  # fmt: skip
         return self._restored(stress)

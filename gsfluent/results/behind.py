@@ -1,4 +1,4 @@
-"""Files that are written beside the work: in order, by one thread, a few at most waiting."""
+"""What is done beside the work: in order, by one thread, a little at most waiting."""
 
 from __future__ import annotations
 
@@ -9,18 +9,23 @@ from types import TracebackType
 from typing import Any
 
 ROOM = 2
-"""Files that may wait; more would be held in memory."""
+"""What may wait, files for example; more would be held in memory."""
 
 
 class Behind:
     """A thread that does what it is given, one thing after the other.
 
-    What goes wrong there is raised by the next call here. Leaving the ``with`` block waits for all
+    What goes wrong there is raised by the next call here, and what was given after it is left
+    undone. Leaving the ``with`` block waits for all
     that was given; an error of the block itself comes first.
+
+    Args:
+        room: How much may wait, what is being done among it.
     """
 
-    def __init__(self) -> None:
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gsfluent-writer")
+    def __init__(self, room: int = ROOM) -> None:
+        self._room, self._failed = room, False
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gsfluent-behind")
         self._given: deque[Future[Any]] = deque()
 
     def __enter__(self) -> Behind:
@@ -38,16 +43,25 @@ class Behind:
         """Have something done after all that was given before.
 
         Raises:
-            RunError: Something given before could not be written.
+            Exception: What went wrong with something given before.
         """
-        self._settle(ROOM - 1)
-        self._given.append(self._pool.submit(work, *given))
+        self._settle(self._room - 1)
+        self._given.append(self._pool.submit(self._one, work, *given))
+
+    def _one(self, work: Callable[..., Any], *given: Any) -> None:
+        if self._failed:
+            return
+        try:
+            work(*given)
+        except BaseException:
+            self._failed = True
+            raise
 
     def wait(self) -> None:
         """Wait for all that was given.
 
         Raises:
-            RunError: Some of it could not be written.
+            Exception: What went wrong with some of it.
         """
         self._settle(0)
 

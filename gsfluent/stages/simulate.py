@@ -18,7 +18,7 @@ from gsfluent.materials import Material
 from gsfluent.pipeline.colliders.splats import bare_points, bare_splats, blade_splats, rigid_splats
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.engine import SolverOptions
-from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
+from gsfluent.pipeline.simulate.stage import Moment, Simulate, SimulationFrame
 from gsfluent.results.behind import Behind
 from gsfluent.results.frames import SavedFrame, count_frames, packed_frame, write_frame
 from gsfluent.results.partition import FILE as PARTITION
@@ -43,6 +43,9 @@ _STATE = "state.pt"
 PATIENCE = 20.0
 """A state that took a second to write is written again after so many: a run spends a twentieth of
 its time on it at most, and loses no more than that when it is stopped."""
+AHEAD = 3
+"""Frames that the run may be ahead of the repair of their cracks: those in which much breaks take
+long. Each holds its points."""
 _STEEL_ROWS = 2**40
 
 
@@ -173,7 +176,7 @@ def simulate_stage(context: RunContext) -> None:
         def keep(ended: bool = False) -> None:
             """What is known so far, when all frames are on disk."""
             nonlocal written
-            behind.wait()
+            files.wait()
             strikes.keep(ended)
             partition = history.partition()
             # both only grow, and all else of it stays
@@ -185,16 +188,24 @@ def simulate_stage(context: RunContext) -> None:
             written = grown
 
         saved_at, cost = time.monotonic(), 0.0
-        with Behind() as behind:
-            for frame in frames:
-                behind.do(write_frame, folder, frame.index, packed_frame(saved(frame, scene)))
-                strikes.see(frame)
-                begun = time.monotonic()
-                if begun - saved_at >= PATIENCE * cost:
-                    keep()
-                    frames.save(state)
-                    saved_at = time.monotonic()
-                    cost = saved_at - begun
+
+        def finish(moment: Moment) -> None:
+            """Wrap up a frame, while the run goes on to the next ones."""
+            nonlocal saved_at, cost
+            frame = moment.frame()
+            files.do(write_frame, folder, frame.index, packed_frame(saved(frame, scene)))
+            strikes.see(frame)
+            begun = time.monotonic()
+            if begun - saved_at >= PATIENCE * cost:
+                keep()
+                moment.save(state)
+                saved_at = time.monotonic()
+                cost = saved_at - begun
+
+        with Behind() as files:
+            with Behind(AHEAD) as repair:
+                while (moment := frames.advance()) is not None:
+                    repair.do(finish, moment)
             keep(ended=True)
         unbroken, report = strikes.unbroken(), frames.report
         notes = [finer] if finer else []

@@ -44,8 +44,9 @@ BARS = {
     (300, 100, "lattice"): 1.0, (300, 100, "random"): 1.1,
 }  # fmt: skip
 CPU_PEER, CPU_BAR = {(100, 24): 47.5}, {(100, 24): 12.0}
-BYTES = {"elastic": 208, "nacc": 224}
-"""Bytes a point must move in a step: p2g reads 68, g2p reads 48 and writes 92 (NACC 16 more)."""
+BYTES = {"elastic": 208, "nacc": 224, "relaxing": 292}
+"""Bytes a point must move in a step: p2g reads 68, g2p reads 48 and writes 92 (NACC 16 more, its
+branch 68)."""
 
 
 def walls(n: int, dx: float, device: torch.device) -> Tensor:
@@ -87,12 +88,16 @@ def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> op
         body = (x[:, 2] > middle).to(torch.int32)
         if kind == "apart":
             x[:, 2] += 4 * round(0.3 / (4 * dx)) * dx * body  # whole blocks
-    law = 1 if kind == "nacc" else 0
+    law = 1 if kind in ("nacc", "relaxing") else 0
+    branch = None
+    if kind == "relaxing":  # nacc with a share of 0.5 that relaxes in 10 ms
+        branch = torch.zeros(count, 9, device=device)
+        branch[:, 6], branch[:, 7] = 0.5, 100.0
     return ops.Solver(
         x, velocity, 1000.0 * volume, volume, dx=dx, dt=1e-4, gravity=(0.0, 0.0, -9.8),
         law=torch.tensor([law], dtype=torch.int32, device=device), body=body,
         params=torch.tensor([row], device=device), colliders=walls(n, dx, device),
-        alpha=torch.full((count,), -0.4, device=device) if law else None,
+        alpha=torch.full((count,), -0.4, device=device) if law else None, viscous=branch,
     )  # fmt: skip
 
 
@@ -120,7 +125,7 @@ def measure(n: int, cells: int, order: str, kind: str, device: torch.device) -> 
     # Others work on the machine too: the least is what the code needs of a core.
     middle = times[len(times) // 2] if device.type == "cuda" else times[0]
     counters = solver.counters()
-    need = BYTES["nacc" if kind == "nacc" else "elastic"] * solver.count
+    need = BYTES.get(kind, BYTES["elastic"]) * solver.count
     height = float(solver.position[:, 2].mean())
     return {
         "grid": n, "cells": cells, "order": order, "kind": kind, "particles": solver.count,

@@ -279,3 +279,8 @@ def test_what_is_written_behind_the_work_keeps_its_order_and_its_errors() -> Non
         behind.do(write, 3)
         raise KeyboardInterrupt
     assert done == [0, 1, 2, 4]
+    # what was given after it is left undone, however much may wait
+    with pytest.raises(RunError, match="the disk is full"), Behind(3) as behind:
+        for number in (5, 3, 6):
+            behind.do(write, number)
+    assert done == [0, 1, 2, 4, 5]

@@ -25,4 +25,14 @@ struct ReturnMappingArgs {
   int32_t* info;  // [4] plastic, guarded, inverted, invalid particles; zeroed by the caller
 };
 
+template <typename T>
+struct StoredEnergyArgs {
+  int64_t count;
+  const T* strain;          // [count, 6] b - I
+  int64_t rows;             // rows of params
+  const T* params;          // [rows, 8]
+  const int32_t* material;  // [count] as above
+  T* energy;                // [count] per initial volume [J/m^3]
+};
+
 }  // namespace gsf

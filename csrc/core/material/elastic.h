@@ -109,12 +109,27 @@ GSF_HOST_DEVICE Sym3<T> kirchhoff_stress(T mu, T kappa, const Sym3<T>& d, T j2m1
 // Stored energy per initial volume [J/m^3]; tr(m I + d) - 3 = 3 (m - 1) avoids the cancellation of
 // J^(-2/3) tr b - 3, and the volumetric part is summed as a series near J = 1.
 template <typename T>
-GSF_HOST_DEVICE T elastic_energy(T mu, T kappa, const ElasticState<T>& s) {
+GSF_HOST_DEVICE T stored_energy(T mu, T kappa, const Sym3<T>& d, T j2m1, T log_j) {
   using std::abs;
-  const T x = s.j2m1;
+  const T x = j2m1;
   const T series = x * x * (T(0.5) - x * (T(1.0 / 3.0) - x * (T(0.25) - x * T(0.2))));
-  const T volumetric = abs(x) < T(1e-3) ? series : x - T(2) * log_volume(s);
-  return T(1.5) * mu * unit_det_shift(s.d) + T(0.25) * kappa * volumetric;
+  const T volumetric = abs(x) < T(1e-3) ? series : x - T(2) * log_j;
+  return T(1.5) * mu * unit_det_shift(d) + T(0.25) * kappa * volumetric;
+}
+
+template <typename T>
+GSF_HOST_DEVICE T elastic_energy(T mu, T kappa, const ElasticState<T>& s) {
+  return stored_energy(mu, kappa, s.d, s.j2m1, log_volume(s));
+}
+
+// The same of a strain as it is, without guards: nan where det b is not positive.
+template <typename T>
+GSF_HOST_DEVICE T unguarded_energy(T mu, T kappa, const Sym3<T>& e) {
+  using std::exp;
+  using std::log1p;
+  const T x = det_minus_one(e);
+  const T log_j = T(0.5) * log1p(x);
+  return stored_energy(mu, kappa, exp(T(-2.0 / 3.0) * log_j) * deviator(e), x, log_j);
 }
 
 }  // namespace gsf

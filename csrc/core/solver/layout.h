@@ -6,6 +6,7 @@
 //   velocity     velocity and slope, twelve components          three planes of four
 //   strain       six components                                 a plane of four, one of two
 //   deformation  nine components                                two planes of four, one of one
+//   viscous      nine components                                likewise
 //
 // `meta` and `slope` of SolverView are null there.
 #pragma once
@@ -153,6 +154,31 @@ GSF_HOST_DEVICE void store_deformation(const SolverView<T>& s, int64_t p, const 
   s.deformation[8 * s.count + p] = f[8];
 #else
   for (int c = 0; c < 9; ++c) s.deformation[9 * p + c] = f[c];
+#endif
+}
+
+// The nine words of a point's viscosity.
+template <typename T>
+GSF_HOST_DEVICE void load_viscous(const SolverView<T>& s, int64_t p, T* own) {
+#ifdef __CUDA_ARCH__
+  const Quad<T> a = quad_plane(s, s.viscous, 0)[p], b = quad_plane(s, s.viscous, 1)[p];
+  const T last = s.viscous[8 * s.count + p];
+  const T values[9] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, last};
+  for (int c = 0; c < 9; ++c) own[c] = values[c];
+#else
+  for (int c = 0; c < 9; ++c) own[c] = s.viscous[9 * p + c];
+#endif
+}
+// The strain of its spring, its first six words; `own` as it was loaded.
+template <typename T>
+GSF_HOST_DEVICE void store_spring(const SolverView<T>& s, int64_t p, const Sym3<T>& e,
+                                  const T* own) {
+#ifdef __CUDA_ARCH__
+  quad_plane(s, s.viscous, 0)[p] = {e.xx, e.yy, e.zz, e.xy};
+  quad_plane(s, s.viscous, 1)[p] = {e.xz, e.yz, own[6], own[7]};
+#else
+  const T values[6] = {e.xx, e.yy, e.zz, e.xy, e.xz, e.yz};
+  for (int c = 0; c < 6; ++c) s.viscous[9 * p + c] = values[c];
 #endif
 }
 

@@ -17,8 +17,7 @@ inline constexpr double kWeakening = 0.02;
 // Laws a kernel is compiled for: fewer laws, fewer registers.
 // kMoreLaws: those of more_laws.h too; on the CPU only (cpu/solver/solver_more.cpp).
 // kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
-// kViscousBrittle: elastic and NACC with Maxwell branches; CPU only
-// (cpu/solver/solver_viscous.cpp).
+// kViscousBrittle: elastic and NACC with Maxwell branches (on the CPU solver_viscous.cpp).
 enum LawSet : int {
   kElasticOnly = 0,
   kBrittle = 1,
@@ -194,7 +193,8 @@ template <typename T>
 GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T* row,
                                       const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
                                       T dt, ReturnMapped<T>& out) {
-  T* own = s.viscous + kViscousColumns * p;
+  T own[kViscousColumns];
+  load_viscous(s, p, own);
   const T share = own[6];
   T left = T(1);  // of the spring's strain
   if (out.plastic) {
@@ -217,9 +217,7 @@ GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T
     out.invalid = true;
   }
   const ElasticState<T> spring = elastic_state(e, out.inverted);
-  e = kept_strain(spring);
-  const T values[6] = {e.xx, e.yy, e.zz, e.xy, e.xz, e.yz};
-  for (int c = 0; c < 6; ++c) own[c] = values[c];
+  store_spring(s, p, kept_strain(spring), own);
   out.stress =
       shared_stress(out.stress, kirchhoff_stress(row[0], row[1], spring.d, spring.j2m1), share);
 }

@@ -198,7 +198,7 @@ struct SolverView {
   // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
   // null: colliders hold nodes; CPU only
   const T* radius;
-  // [N, 9] viscosity of each point (core/material/viscous.h), or null; CPU only
+  // [N, 9] viscosity of each point (core/material/viscous.h), or null
   T* viscous;
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes; CPU only

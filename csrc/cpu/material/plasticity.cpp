@@ -15,6 +15,9 @@ template <typename T>
 bool any_compiled_apart(const ReturnMappingArgs<T>& a);
 template <typename T>
 bool more_particle(const ReturnMappingArgs<T>& a, int64_t i, ReturnFlags& flags);
+// plasticity_stored.cpp:
+template <typename T>
+void stored_energies(const StoredEnergyArgs<T>& a, int64_t begin, int64_t end);
 
 namespace {
 
@@ -43,6 +46,10 @@ struct PlasticityCpu {
       for (int c = 0; c < 4; ++c)
         std::atomic_ref<int32_t>(a.info[c]).fetch_add(counts[c], std::memory_order_relaxed);
     });
+  }
+  template <typename T>
+  static void neo_hookean_energy(const StoredEnergyArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 512, [&](int64_t begin, int64_t end) { stored_energies(a, begin, end); });
   }
 };
 

@@ -10,4 +10,7 @@ namespace gsf::cuda {
 template <typename T>
 cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream);
 
+template <typename T>
+cudaError_t neo_hookean_energy(const StoredEnergyArgs<T>& args, cudaStream_t stream);
+
 }  // namespace gsf::cuda

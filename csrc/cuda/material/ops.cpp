@@ -1,4 +1,4 @@
-// CUDA registration of return_mapping.
+// CUDA registration of return_mapping and neo_hookean_energy.
 #include "cuda/material/launch.h"
 #include "cuda/stream.h"
 #include "host/plasticity.h"
@@ -9,6 +9,7 @@ namespace {
 struct PlasticityCuda {
   using Scope = CudaScope;
   GSF_LAUNCH(return_mapping)
+  GSF_LAUNCH(neo_hookean_energy)
 };
 
 }  // namespace

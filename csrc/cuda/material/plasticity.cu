@@ -1,5 +1,7 @@
-// CUDA kernel of return_mapping: one thread per particle; counters reduced per block first.
+// CUDA kernels of return_mapping and neo_hookean_energy: one thread per particle; the counters of
+// return_mapping are reduced per block first.
 #include "core/material/return_mapping.h"
+#include "core/material/stored_energy.h"
 #include "cuda/material/launch.h"
 
 namespace gsf::cuda {
@@ -23,6 +25,12 @@ __global__ void __launch_bounds__(128) return_mapping_kernel(const ReturnMapping
   }
 }
 
+template <typename T>
+__global__ void __launch_bounds__(128) stored_energy_kernel(const StoredEnergyArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) stored_energy_particle(a, i);
+}
+
 }  // namespace
 
 template <typename T>
@@ -36,5 +44,17 @@ cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream
 
 template cudaError_t return_mapping(const ReturnMappingArgs<float>&, cudaStream_t);
 template cudaError_t return_mapping(const ReturnMappingArgs<double>&, cudaStream_t);
+
+template <typename T>
+cudaError_t neo_hookean_energy(const StoredEnergyArgs<T>& args, cudaStream_t stream) {
+  if (args.count == 0) return cudaSuccess;
+  constexpr int kThreads = 128;
+  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
+  stored_energy_kernel<T><<<blocks, kThreads, 0, stream>>>(args);
+  return cudaGetLastError();
+}
+
+template cudaError_t neo_hookean_energy(const StoredEnergyArgs<float>&, cudaStream_t);
+template cudaError_t neo_hookean_energy(const StoredEnergyArgs<double>&, cudaStream_t);
 
 }  // namespace gsf::cuda

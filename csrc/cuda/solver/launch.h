@@ -17,6 +17,6 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
 cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream);
 template <typename T>
-cudaError_t solver_prime(const SolverView<T>& s, cudaStream_t stream);
+cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream);
 
 }  // namespace gsf::cuda

@@ -70,8 +70,8 @@ class Round {
 struct SolverCuda {
   using Scope = CudaScope;
   template <typename T>
-  static void prime(const SolverView<T>& s, int, const Scope& scope) {
-    check_cuda("solver_prime", cuda::solver_prime(s, scope.stream()));
+  static void prime(const SolverView<T>& s, int law_set, const Scope& scope) {
+    check_cuda("solver_prime", cuda::solver_prime(s, law_set, scope.stream()));
   }
   template <typename T>
   static void run(const SolverView<T>& s, int law_set, int64_t rounds, int64_t steps,

@@ -8,7 +8,9 @@ namespace {
 constexpr int kThreads = kSolverThreads;
 constexpr int kG2PThreads = 128;  // as kP2GThreads
 // CTAs of a multiprocessor: more for the laws that need fewer registers.
-constexpr int g2p_ctas(int laws) { return laws == kElasticOnly ? 7 : 6; }
+constexpr int g2p_ctas(int laws) {
+  return laws == kElasticOnly ? 7 : (laws == kViscousBrittle ? 5 : 6);
+}
 
 // Brings the line at p near; nothing waits for it.
 __device__ inline void prefetch(const void* p) {
@@ -133,7 +135,7 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws))
   if (last_to_arrive(&s.clock->arrived, arrivals)) end_of_step(s);
 }
 
-template <typename T>
+template <typename T, int kLaws>
 __global__ void __launch_bounds__(kThreads)
     prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
@@ -147,7 +149,8 @@ __global__ void __launch_bounds__(kThreads)
   const T dt = T(clock.dt);
   Largest largest{};
   for (int64_t r = threadIdx.x; r < count; r += kThreads)
-    if (first + r >= 0 && first + r < s.count) prime_particle(s, first + r, measure, dt, largest);
+    if (first + r >= 0 && first + r < s.count)
+      prime_particle<T, kLaws>(s, first + r, measure, dt, largest);
   __syncwarp();
   const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
   unsigned bits[4];
@@ -163,10 +166,13 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 template <typename T>
-cudaError_t solver_prime(const SolverView<T>& s, cudaStream_t stream) {
+cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
-  prime_kernel<T><<<homes, kThreads, 0, stream>>>(s, true);
-  prime_kernel<T><<<homes, kThreads, 0, stream>>>(s, false);
+  for (const bool measure : {true, false})
+    if (law_set == kViscousBrittle)
+      prime_kernel<T, kViscousBrittle><<<homes, kThreads, 0, stream>>>(s, measure);
+    else
+      prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
   return cudaGetLastError();
 }
 
@@ -194,6 +200,10 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     g2p_kernel<T, kBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (law_set == kBrittle)
     g2p_kernel<T, kBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+  else if (law_set == kViscousBrittle && !track)
+    g2p_kernel<T, kViscousBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+  else if (law_set == kViscousBrittle)
+    g2p_kernel<T, kViscousBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (!track)
     g2p_kernel<T, kAnyLaw, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else
@@ -201,8 +211,8 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   return cudaGetLastError();
 }
 
-#define GSF_INSTANTIATE(T)                                                  \
-  template cudaError_t solver_prime<T>(const SolverView<T>&, cudaStream_t); \
+#define GSF_INSTANTIATE(T)                                                       \
+  template cudaError_t solver_prime<T>(const SolverView<T>&, int, cudaStream_t); \
   template cudaError_t solver_step<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

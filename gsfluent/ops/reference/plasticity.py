@@ -42,7 +42,9 @@ __all__ = [
     "Options",
     "elastic_energy",
     "gather_material",
+    "neo_hookean_energy",
     "normalized",
+    "of_other_laws",
     "return_mapping",
     "strain_from_isochoric",
     "to_matrix",
@@ -206,14 +208,22 @@ def return_mapping(
 
 def elastic_energy(strain: Tensor, m: Material, laws: Tensor | None = None) -> Tensor:
     """Stored energy per initial volume [J/m^3], [N]; ``laws`` [N], neo-Hookean where None."""
+    energy = neo_hookean_energy(strain, m)
+    return energy if laws is None else of_other_laws(energy, strain, m, laws)
+
+
+def neo_hookean_energy(strain: Tensor, m: Material) -> Tensor:
+    """Stored energy per initial volume [J/m^3] of the laws elastic and nacc, [N]."""
     x = det_minus_one(to_matrix(strain))
     log_j = 0.5 * torch.log1p(x)
     d = torch.exp(-2.0 / 3.0 * log_j)[:, None] * (strain - diagonal(strain[:, :3].mean(1)))
     series = x * x * (0.5 - x * (1.0 / 3.0 - x * (0.25 - x * 0.2)))
     volumetric = torch.where(x.abs() < 1e-3, series, x - 2.0 * log_j)
-    energy = 1.5 * m.mu * unit_det_shift(d) + 0.25 * m.kappa * volumetric
-    if laws is None:
-        return energy
+    return 1.5 * m.mu * unit_det_shift(d) + 0.25 * m.kappa * volumetric
+
+
+def of_other_laws(energy: Tensor, strain: Tensor, m: Material, laws: Tensor) -> Tensor:
+    """Energies [N] in which those of other laws than elastic and nacc are replaced by their own."""
     for number in laws.unique().tolist():
         if number > 1:
             rows = (laws == number).nonzero()[:, 0]

@@ -89,7 +89,7 @@ class Hull:
         """Distances of the voxels outside from the boundary [voxels], with a rim."""
         outside = functional.pad(~self.occupancy, (_RIM,) * 6, value=True).cpu().numpy()
         away = np.where(outside, distance_transform(outside) - 0.5, 0.0)
-        return torch.from_numpy(away.astype(np.float32))
+        return torch.from_numpy(away.astype(np.float32)).to(self.occupancy.device)
 
 
 def focus_point(viewmats: Tensor) -> Tensor:

@@ -31,6 +31,8 @@ _HALF = (0, 60, 11, 3)  # parts to each side at most, of splats with so many wid
 _LEAST = 1.0 / 255.0  # opacity below which a part is left out
 _OPAQUE = 0.99
 _OPACITIES = 65  # of wide splats that are fitted; what lies between is interpolated
+_TOGETHER = {"cpu": 1 << 20}  # numbers of the fit that are worked on at once: as the cache is
+_TOGETHER_ELSEWHERE = 1 << 24  # where launches cost more than memory
 _ROUNDS = 12  # of the multiplicative fit; more change nothing to see
 
 
@@ -116,7 +118,11 @@ def _opacities(depth: Tensor, places: Tensor, lattice: Tensor) -> Tensor:
     seen = torch.exp(-0.5 * (places[:, None] - lattice[None]).square().sum(dim=2))
     share = seen / seen.sum(dim=0)
     opacity = -torch.expm1(-(depth @ share) / seen.sum(dim=1).mean())
+    most = _TOGETHER.get(depth.device.type, _TOGETHER_ELSEWHERE)
+    together = max(1, most // seen.numel())  # rows
     for _ in range(_ROUNDS):
-        found = torch.stack([-torch.log1p(-row * seen).sum(dim=1) for row in opacity])
+        found = torch.cat(
+            [-torch.log1p(-some[:, None] * seen).sum(dim=2) for some in opacity.split(together)]
+        )
         opacity = (opacity * ((depth / found.clamp(min=1e-12)) @ share)).clamp(max=_OPAQUE)
     return opacity

@@ -13,6 +13,8 @@ the order of the points, on threads, or on the device.
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -44,10 +46,11 @@ _FINE = 2.0**20
 _SHARES = 2.0**40
 
 
-class Web(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Web:
     """What hangs together at rest; does not change.
 
-    Attributes:
+    Args:
         links: Pairs of rows of one body, int64 [L, 2].
         rest: Positions at rest [m], [N, 3].
         body: Body of each point, int64 [N].
@@ -67,6 +70,34 @@ class Web(NamedTuple):
     flowing: Tensor
     may_break: Tensor
     dust: Tensor
+
+    @functools.cached_property
+    def length(self) -> Tensor:
+        """Length of each link at rest [m], float64 [L]."""
+        a, b = self.links.unbind(dim=1)
+        return _length(self.rest[a], self.rest[b])
+
+    @functools.cached_property
+    def share(self) -> Tensor:
+        """Share of the mass that each body has, float64 [bodies]."""
+        mass = self.mass.double()
+        # on the CPU, where sums have an order
+        body, part = self.body.cpu(), (mass / mass.sum()).cpu()
+        share = torch.zeros(self.may_break.shape[0], dtype=torch.float64)
+        return share.index_add_(0, body, part).to(mass.device)
+
+    def check(self) -> None:
+        """Raise a ValueError where a shape does not match or a link names no point."""
+        links, count = self.links, self.rest.shape[0]
+        if links.ndim != 2 or links.shape[1] != 2:
+            raise ValueError(f"find_pieces: links must have shape [L, 2], got {list(links.shape)}")
+        if not self._named:
+            raise ValueError(f"find_pieces: links must name rows 0 to {count - 1}")
+
+    @functools.cached_property
+    def _named(self) -> bool:
+        links, count = self.links, self.rest.shape[0]
+        return not links.numel() or (int(links.min()) >= 0 and int(links.max()) < count)
 
 
 class Pieces(NamedTuple):
@@ -125,7 +156,7 @@ def find_pieces(
     device = body.device
     a, b = web.links.unbind(dim=1)
     fixed = ~(web.flowing[a] | web.flowing[b])
-    length = _length(web.rest[a], web.rest[b])
+    length = web.length
     ratio = _length(position[a], position[b]) / length.clamp(min=1e-30)
     open_ = ratio > torch.where(broken[a] | broken[b], OPEN, TORN)
     cut = cut_links | (open_ & fixed & web.may_break[body[a]])
@@ -200,11 +231,8 @@ def dust_limit(share: Tensor, points: Tensor) -> Tensor:
 
 
 def _check(web: Web, position: Tensor, broken: Tensor, cut_links: Tensor) -> None:
+    web.check()
     links, count = web.links, web.rest.shape[0]
-    if links.ndim != 2 or links.shape[1] != 2:
-        raise ValueError(f"find_pieces: links must have shape [L, 2], got {list(links.shape)}")
-    if links.numel() and not (int(links.min()) >= 0 and int(links.max()) < count):
-        raise ValueError(f"find_pieces: links must name rows 0 to {count - 1}")
     for name, value in (("position", position), ("broken", broken), ("mass", web.mass)):
         if value.shape[0] != count:
             raise ValueError(

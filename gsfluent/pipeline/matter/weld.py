@@ -87,11 +87,7 @@ def weldable(matter: Matter, web: Web, state: State, pieces: Pieces) -> Tensor:
     ids = pieces.fragments.ids.to(labels.device)
     fractions = pieces.fragments.mass_fractions.to(labels.device)
     bodies = web.may_break.shape[0]
-    mass = web.mass.double()
-    share = torch.zeros(bodies, dtype=torch.float64).index_add_(
-        0, web.body.cpu(), (mass / mass.sum()).cpu()
-    )
-    large = fractions > PIECE * share.to(labels.device)[web.body[ids]]
+    large = fractions > PIECE * web.share[web.body[ids]]
     apart = torch.bincount(web.body[ids[large]], minlength=bodies) >= 2
     if not bool(apart.any()):
         return none

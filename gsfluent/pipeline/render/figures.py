@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.render.flicker import Flow, flicker
 from gsfluent.pipeline.render.holes import Holes, MatterView, small
 from gsfluent.results.frames import SavedFrame
+from gsfluent.spatial.neighbours import nearest_in_group
 
 AROUND = ((30.0, 15.0), (150.0, 15.0), (270.0, 15.0))
 """Azimuth and elevation of the cameras around the matter [degrees]."""
@@ -36,6 +36,12 @@ _NEIGHBOURS = 8
 _FIGURES = ("hole_fraction", "see_through", "hole_fraction_around", "see_through_around", "flicker")
 
 
+def spacing_of(frame: SavedFrame) -> float:
+    """Median edge of the material points [m]; 0 where there are none."""
+    volume = frame.volumes
+    return float(volume.clamp(min=0.0).pow(1 / 3).median()) if len(volume) else 0.0
+
+
 class RawCarry:
     """Splats carried rigidly by the material point that was nearest to them at the start.
 
@@ -44,8 +50,6 @@ class RawCarry:
     """
 
     def __init__(self, first: SavedFrame) -> None:
-        from scipy.spatial import cKDTree
-
         # splats of solids have a number of their own; bullets, liquids, rigid things and repairs
         # are drawn as they are
         solids = (first.ids[: first.carried] >= 0).nonzero()[:, 0]
@@ -55,21 +59,12 @@ class RawCarry:
         self._rest = first.positions
         body = first.body.long()
         splat_body = body[first.anchor[solids].long().clamp(min=0)]
-        nearest = torch.zeros(len(solids), dtype=torch.int64)
-        near = torch.zeros(len(body), _NEIGHBOURS, dtype=torch.int64)
-        points, means = first.positions.cpu().numpy(), self.gaussians.means.cpu().numpy()
-        for number in body.unique().tolist():
-            rows = (body == number).nonzero()[:, 0].cpu()
-            tree = cKDTree(points[rows.numpy()])
-            k = min(_NEIGHBOURS, len(rows))
-            found = tree.query(points[rows.numpy()], k=k)[1].reshape(-1, k)
-            found = found[:, np.arange(_NEIGHBOURS).clip(max=k - 1)]
-            near[rows] = rows[torch.from_numpy(found)]
-            mine = (splat_body == number).nonzero()[:, 0].cpu()
-            if len(mine):
-                nearest[mine] = rows[torch.from_numpy(tree.query(means[mine.numpy()])[1])]
-        device = first.positions.device
-        self._nearest, self._near = nearest.to(device), near.to(device)
+        points, spacing = first.positions, spacing_of(first) or 1.0
+        # of a body of fewer points, its own again
+        near = nearest_in_group(points, body, points, body, _NEIGHBOURS, spacing)[1]
+        self._near = torch.where(near < 0, near[:, :1], near)
+        found = nearest_in_group(points, body, self.gaussians.means, splat_body, 1, spacing)[1]
+        self._nearest = found[:, 0].clamp(min=0)
 
     def at(self, frame: SavedFrame) -> Gaussians:
         """The splats at another moment; colours of degree 0."""
@@ -117,8 +112,7 @@ class FilmFigures:
         self, first: SavedFrame, around: Sequence[Camera] = (), *, every: int = EVERY
     ) -> None:
         self._first, self._around, self._every = first, list(around), every
-        volume = first.volumes
-        self._spacing = float(volume.clamp(min=0.0).pow(1 / 3).median()) if len(volume) else 0.0
+        self._spacing = spacing_of(first)
         self._last: _Last | None = None
         self._broken = 0
         self._values: dict[str, list[float | int | None]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -32,6 +33,8 @@ from gsfluent.results.record import read_frame
 
 # The pieces need a moment to part before a picture of them tells anything.
 _POSTER_DELAY = 0.08
+_READERS = {"cpu": 1}  # threads that read frames ahead
+_READERS_ELSEWHERE = 3  # where a picture takes less than to read a frame
 _RESIDUE = 4.0  # voxels around a solid in which no background is believed
 
 
@@ -91,13 +94,16 @@ class Film:
         return load_frame(self.folder, index).to(self.device)
 
     def frames(self) -> Iterator[SavedFrame]:
-        """All frames in order; while one is drawn, the next is read."""
-        with ThreadPoolExecutor(max_workers=1) as pool:
-            ahead = pool.submit(self.frame, 0)
-            for index in range(len(self)):
-                frame = ahead.result()
-                if index + 1 < len(self):
-                    ahead = pool.submit(self.frame, index + 1)
+        """All frames in order; while one is drawn, the next ones are read."""
+        readers = _READERS.get(self.device.type, _READERS_ELSEWHERE)
+        with ThreadPoolExecutor(readers) as pool:
+            ahead = deque(
+                pool.submit(self.frame, index) for index in range(min(readers, len(self)))
+            )
+            for index in range(readers, len(self) + readers):
+                frame = ahead.popleft().result()
+                if index < len(self):
+                    ahead.append(pool.submit(self.frame, index))
                 yield frame
 
     def picture(self, frame: SavedFrame) -> Picture:

@@ -9,5 +9,5 @@ __getattr__, __dir__, __all__ = room(
     groups="LANDING",
     grow="copy_of grow shrink",
     run="Run",
-    stage="QUALITY Simulate SimulationFrame frame_of",
+    stage="Moment QUALITY Simulate SimulationFrame frame_of",
 )

@@ -293,8 +293,8 @@ class Watch:
     )  # fmt: skip
 
     def state(self) -> dict[str, float | int | list[str]]:
-        """Return what a resumed run needs."""
-        return {name: getattr(self, name) for name in self._KEPT}
+        """Return what a resumed run needs; it stays as it is when this goes on."""
+        return {name: copy.copy(getattr(self, name)) for name in self._KEPT}
 
     def restore(self, values: dict[str, Any]) -> None:
         """Inverse of :meth:`state`."""

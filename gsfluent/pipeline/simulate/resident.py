@@ -73,7 +73,7 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         return False  # not there yet
     if matter.viscous:
         known = matter.law.new_tensor([LAWS["elastic"], LAWS["nacc"]])
-        if matter.law.is_cuda or not bool(torch.isin(matter.law, known).all()):
+        if not bool(torch.isin(matter.law, known).all()):
             return False  # not there yet
     if not rigid.frees:
         return True

@@ -60,7 +60,9 @@ class Run:
         self.stepper = Stepper(scene, matter, options)
         self._set(scene, matter)
         device = matter.particles.device
-        self.links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
+        links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
+        # each end's rows one after the other: every look gathers by them
+        self.links = links.t().contiguous().t()
         self.state = self.stepper.initial(self.links.shape[0])
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
@@ -88,6 +90,7 @@ class Run:
         shares = [body.material.dust for body in scene.bodies]
         self._dust = torch.tensor(shares, dtype=torch.float64, device=device)
         self._spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=device)
+        self._whole: Web | None = None
 
     def fit(self, scene: Scene, matter: Matter) -> None:
         """Go on with another scene and its matter; see :mod:`gsfluent.pipeline.simulate.grow`."""
@@ -174,14 +177,16 @@ class Run:
 
     def _web(self, state: State) -> Web:
         """What hangs together at rest, and which bodies can come apart."""
-        may_break = self._breakable
-        if self.scene.blades:
-            may_break = may_break | cut_bodies(self.matter, state.cut)
-        p = self.matter.particles
-        return Web(
-            self.links, self.matter.rest, p.body.long(), self._spacing, p.mass, self._flowing,
-            may_break, self._dust,
-        )  # fmt: skip
+        if self._whole is None:
+            p = self.matter.particles
+            self._whole = Web(
+                self.links, self.matter.rest, p.body.long(), self._spacing, p.mass, self._flowing,
+                self._breakable, self._dust,
+            )  # fmt: skip
+        if not self.scene.blades:
+            return self._whole
+        may_break = self._breakable | cut_bodies(self.matter, state.cut)
+        return dataclasses.replace(self._whole, may_break=may_break)
 
     def _look(self, state: State) -> Pieces:
         """The pieces of a state; those of the last one asked for are kept."""
@@ -257,21 +262,27 @@ class Run:
         whole = float((mass * can).sum())
         return float((mass * (can & (pieces.labels < 0))).sum()) / whole if whole > 0.0 else 0.0
 
-    def save(self, path: str | Path, repair: dict[str, Any]) -> None:
-        """Write the state of the last frame, and that of the repair of cracks."""
-        counters = dataclasses.asdict(self.stepper.counters)
+    def kept(self) -> Callable[[str | Path, dict[str, Any]], None]:
+        """What writes the state of this moment, also when the run has gone on.
+
+        It takes the file's path and the state of the repair of cracks.
+        """
+        state, matter = self.state, self.matter
         extra = {
-            "counters": counters,
+            "counters": dataclasses.asdict(self.stepper.counters),
             "watch": self.watch.state(),
             "ledger": {"worst": self.ledger.worst, "scale": self.ledger.scale},
             "dt_scale": self.stepper.dt_scale,
             "field_limit": self.stepper.field_limit,
-            "per_frame": self.per_frame,
+            "per_frame": list(self.per_frame),
             "seconds": self.seconds,
             "fps": self.fps,
-            "repair": repair,
         }
-        save_state(path, self.state, self.matter, extra)
+        return lambda path, repair: save_state(path, state, matter, extra | {"repair": repair})
+
+    def save(self, path: str | Path, repair: dict[str, Any]) -> None:
+        """Write the state of the last frame, and that of the repair of cracks."""
+        self.kept()(path, repair)
 
     def resume(self, path: str | Path) -> dict[str, Any]:
         """Take up a saved run; returns the state of the repair of cracks.

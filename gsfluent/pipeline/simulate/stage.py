@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +153,23 @@ class SimulationFrame:
         return carry.follow(self._points, self._rest)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """A frame that has been reached and is not wrapped up yet, while the run may go on.
+
+    Args:
+        index: Frame number.
+        frame: Wraps it up. From any thread, once for each frame and in their order, because the
+            repair of cracks remembers what came before.
+        save: Writes the state of this moment to a file, after ``frame`` and before that of the
+            next one (:meth:`Simulation.save`).
+    """
+
+    index: int
+    frame: Callable[[], SimulationFrame]
+    save: Callable[[str | Path], None]
+
+
 class Simulation(Iterator[SimulationFrame]):
     """A scene that is being simulated; iterate over it for its frames.
 
@@ -179,17 +196,24 @@ class Simulation(Iterator[SimulationFrame]):
 
     def __next__(self) -> SimulationFrame:
         """Simulate up to the next frame."""
-        index = self.run.next_frame
+        moment = self.advance()
+        if moment is None:
+            raise StopIteration
+        return moment.frame()
+
+    def advance(self) -> Moment | None:
+        """Simulate up to the next frame without wrapping it up; None where there is none."""
+        run, history = self.run, self.history
+        index = run.next_frame
         with torch.no_grad():
-            if (
-                index >= self.count
-                or self.run.failure
-                or not self.run.advance_to(index, self._hook)
-            ):
-                raise StopIteration
-            frame = frame_of(self.run, index, self.history)
-        report_progress(self._progress, index + 1, self.count, f"t = {frame.time:.3f} s")
-        return frame
+            if index >= self.count or run.failure or not run.advance_to(index, self._hook):
+                return None
+            frame = moment_of(run, index, history)
+        report_progress(self._progress, index + 1, self.count, f"t = {index / run.fps:.3f} s")
+        kept = run.kept()
+        return Moment(
+            index, frame, lambda path: kept(path, {} if history is None else history.state())
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the state of the last frame, to be given to ``resume`` of :class:`Simulate`.
@@ -330,37 +354,52 @@ def frame_of(
     run: Run, index: int, history: CrackHistory | None, time: float | None = None
 ) -> SimulationFrame:
     """Measure the present state of a run and wrap it up as a frame (``time``: index / fps)."""
+    return moment_of(run, index, history, time)()
+
+
+@torch.no_grad()
+def moment_of(
+    run: Run, index: int, history: CrackHistory | None, time: float | None = None
+) -> Callable[[], SimulationFrame]:
+    """Measure the present state of a run; what is returned wraps it up (:func:`frame_of`)."""
     time = index / run.fps if time is None else time
     now, pieces, stats = run.record(index, time)
-    peak, start, broken = run.state.peak, run.matter.particles.alpha, run.state.ever
-    damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
-    damage = torch.where(broken, 1.0, torch.where(run.matter.brittle, damage, 0.0))
-    particles, points, cracks = run.state.particles, None, None
-    if history is not None and particles.deformation is not None:
-        points = Points.of(
-            particles.position, particles.deformation, pieces.labels, broken, run.units
+    state, matter, rigid = run.state, run.matter, run.stepper.rigid
+    units = run.units if history is not None else None
+
+    @torch.no_grad()
+    def wrap() -> SimulationFrame:
+        peak, start, broken = state.peak, matter.particles.alpha, state.ever
+        damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
+        damage = torch.where(broken, 1.0, torch.where(matter.brittle, damage, 0.0))
+        particles, points, cracks = state.particles, None, None
+        if history is not None and particles.deformation is not None:
+            points = Points.of(
+                particles.position, particles.deformation, pieces.labels, broken, units
+            )
+            cracks = history.step(points)
+            points = points if cracks is None else cracks.points
+        return SimulationFrame(
+            index=index,
+            time=time,
+            particles=particles,
+            damage=damage.clamp(0.0, 1.0),
+            fragments=pieces.labels,
+            energy={
+                "kinetic": now.kinetic,
+                "elastic": now.elastic,
+                "dissipated": stats["dissipated"],
+                "gravity": now.gravity,
+                **({"surface": now.surface} if matter.has_field else {}),
+            },
+            stats=stats,
+            pieces=pieces,
+            broken=broken,
+            rigid=rigid,
+            colliders=state.colliders,
+            _history=history,
+            _points=points,
+            _cracks=cracks,
         )
-        cracks = history.step(points)
-        points = points if cracks is None else cracks.points
-    return SimulationFrame(
-        index=index,
-        time=time,
-        particles=particles,
-        damage=damage.clamp(0.0, 1.0),
-        fragments=pieces.labels,
-        energy={
-            "kinetic": now.kinetic,
-            "elastic": now.elastic,
-            "dissipated": stats["dissipated"],
-            "gravity": now.gravity,
-            **({"surface": now.surface} if run.matter.has_field else {}),
-        },
-        stats=stats,
-        pieces=pieces,
-        broken=broken,
-        rigid=run.stepper.rigid,
-        colliders=run.state.colliders,
-        _history=history,
-        _points=points,
-        _cracks=cracks,
-    )
+
+    return wrap

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -152,7 +153,7 @@ def test_dust_is_bounded_and_the_surplus_joins_its_piece() -> None:
     position = web.rest.double().clone()
     position[powder, 0] += 1.7  # beyond the piece's rigid motion, beside its matter
     for share in (0.0, 0.05, 0.2):
-        part = web._replace(dust=torch.tensor([share]).double())
+        part = dataclasses.replace(web, dust=torch.tensor([share]).double())
         pieces = find_pieces(part, position, broken, cut)
         loose = float(pieces.dust.sum()) / count
         largest = torch.tensor([int((pieces.unit == pieces.fragments.ids[0]).sum())])
@@ -165,7 +166,7 @@ def test_dust_is_bounded_and_the_surplus_joins_its_piece() -> None:
         assert torch.equal(again.dust, gone)
     flown = position.clone()
     flown[powder] += 50.0
-    none = web._replace(dust=torch.zeros(1, dtype=torch.float64))
+    none = dataclasses.replace(web, dust=torch.zeros(1, dtype=torch.float64))
     assert int(find_pieces(none, flown, broken, cut).dust.sum()) == len(powder)
 
 
@@ -236,7 +237,7 @@ def test_a_gpu_finds_the_same_pieces(seed: int) -> None:
     web, position, broken = block(seed=seed)
     cut = torch.zeros(web.links.shape[0], dtype=torch.bool)
     host = find_pieces(web, position, broken, cut)
-    there = Web(*(value.cuda() for value in web))
+    there = Web(*(getattr(web, field.name).cuda() for field in dataclasses.fields(web)))
     device = find_pieces(there, position.cuda(), broken.cuda(), cut.cuda())
     for name in ("unit", "dust", "chip", "cut_links"):
         assert torch.equal(getattr(host, name), getattr(device, name).cpu()), name
@@ -246,9 +247,9 @@ def test_a_gpu_finds_the_same_pieces(seed: int) -> None:
 def test_bad_links_are_refused() -> None:
     web = rope(3)
     with pytest.raises(ValueError, match="rows 0 to 2"):
-        look(web._replace(links=torch.tensor([[0, 3]])), [])
+        look(dataclasses.replace(web, links=torch.tensor([[0, 3]])), [])
     with pytest.raises(ValueError, match="mass must have 3 rows"):
-        look(web._replace(mass=torch.ones(2)), [])
+        look(dataclasses.replace(web, mass=torch.ones(2)), [])
     none = torch.zeros(3, dtype=torch.bool)
     with pytest.raises(ValueError, match="cut_links must have 2 rows"):
         find_pieces(web, web.rest, none, none)

@@ -83,9 +83,10 @@ def test_both_engines_relax_the_same() -> None:
         assert float(apart) < 0.02 * RADIUS, a.index
 
 
-def test_a_run_that_is_resumed_keeps_its_springs(tmp_path: Path) -> None:
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_a_run_that_is_resumed_keeps_its_springs(tmp_path: Path, device: str) -> None:
     wanted, saved = [], tmp_path / "state.pt"
-    stage = Simulate(dx=0.0125, splats=False)
+    stage = Simulate(dx=0.0125, splats=False, device=device)
     whole = stage(dropped(relaxing(0.5)), fps=100, seconds=0.17)
     for frame in whole:
         wanted.append(frame.particles)
@@ -134,7 +135,8 @@ def test_what_leaves_the_grid_as_powder_keeps_no_spring() -> None:
     assert torch.allclose(alone, plain)  # the spring has the strain of the law
 
 
-def test_a_melon_that_relaxes_breaks_all_the_same() -> None:
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_a_melon_that_relaxes_breaks_all_the_same(device: str) -> None:
     melon = materials.get("fruit.watermelon")
     wave = melon.wave_speed * melon.softening**0.5
     melon = melon.override(
@@ -143,9 +145,10 @@ def test_a_melon_that_relaxes_breaks_all_the_same() -> None:
     scene = Scene()
     scene.add(ellipsoid((0.1,) * 3), melon)
     scene.drop(3.0)
-    made = Simulate(dx=0.02, splats=False)(scene, fps=50, seconds=0.9)
+    made = Simulate(dx=0.02, splats=False, device=device)(scene, fps=50, seconds=0.9)
     frames, report = list(made), made.report
     assert report["verdict"] == "clean", report["reason"]
+    assert report["composed_steps"] == 0
     assert frames[-1].stats["damaged_fraction"] > 0.02
     assert bool(torch.isfinite(frames[-1].particles.viscous).all())
 
@@ -163,10 +166,10 @@ def test_half_of_the_two_numbers_is_refused() -> None:
 
 
 @pytest.mark.cuda
-def test_on_a_gpu_it_steps_by_the_operators() -> None:
+def test_on_a_gpu_it_rebounds_the_same() -> None:
     stage = Simulate(dx=2.0 * RADIUS / 8, splats=False, device="cuda")
     made = stage(dropped(relaxing(0.75)), fps=100, seconds=math.sqrt(0.2 / 9.81) + 0.06)
     frames, report = list(made), made.report
     assert report["verdict"] == "clean", report["reason"]
-    assert report["composed_steps"] > 0
-    assert rebound(frames) == pytest.approx(rebound(bounced(0.75, 8)[0]), rel=0.02)
+    assert report["composed_steps"] == 0
+    assert rebound(frames) == pytest.approx(rebound(bounced(0.75, 8)[0]), rel=0.01)
