@@ -2,9 +2,11 @@
 #include "host/shade.h"
 
 #include <algorithm>
+#include <optional>
 #include <vector>
 
 #include "core/shade/shade.h"
+#include "cpu/shade_taps.h"
 
 namespace gsf {
 namespace {
@@ -43,14 +45,18 @@ struct ShadeCpu {
   static void shade(const ShadeArgs<T>& given, const Scope&) {
     ShadeArgs<T> a = given;
     std::vector<int32_t> blockers;
+    std::optional<cpu::PaddedMaps<T>> pairs;
     if (a.map_depth != nullptr) {
       blockers = blocker_sums(a);
+      pairs.emplace(a);
       a.blockers = blockers.data();
+      a.pairs = pairs->data();
     }
     // Short pieces: lit and shadowed rows cost many times what the backdrop does.
     parallel_for(a.height, 8, [&](int64_t begin, int64_t end) {
       for (int64_t line = begin; line < end; ++line)
-        for (int64_t column = 0; column < a.width; ++column) shade_pixel(a, column, line);
+        for (int64_t column = 0; column < a.width; ++column)
+          shade_pixel<cpu::PackTaps<T>>(a, column, line);
     });
   }
 };
