@@ -98,6 +98,17 @@ struct Packet {
     return {a[0], a[1], a[2], a[3], b[2], b[3]};
   }
 
+  // Columns of the rows of their materials.
+  [[gnu::always_inline]] void load_rows(const SolverView<T>& s, Pack<T>* out) const {
+    static_assert(kRowColumns == 12);
+    Quad<T> rows[kLanes];
+    for (int first = 0; first < kRowColumns; first += 4) {
+      for (int lane = 0; lane < kLanes; ++lane)
+        rows[lane] = load_quad(s.rows + int64_t(s.row_of(meta[lane])) * kRowColumns + first);
+      transpose(rows, out + first);
+    }
+  }
+
   // The same the other way, for the lanes in `lanes`.
   template <int kBytes>
   [[gnu::always_inline]] void store_rows(const Quad<T>* rows, T* array, int width, int first,
