@@ -106,7 +106,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "density_normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame, "
       "int nodes, Tensor? eye=None) -> Tensor");
 
-  // --- spatial: labels of voxels, the largest of many fields, the nearest points among cells ---
+  // --- spatial: labels of voxels, the largest of many fields, the nearest points among cells, sums
+  // over boxes of voxels, noise ---
   m.def("nearest_labels(Tensor place, Tensor rank, int[3] shape, float radius) -> Tensor");
   m.def(
       "largest_shares(Tensor? place, int[3] shape, Tensor shares, Tensor box) -> "
@@ -114,6 +115,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def(
       "nearest_in_cells(Tensor points, Tensor queries, Tensor order, Tensor start, Tensor keys, "
       "float[3] low, float cell, int count) -> (Tensor, Tensor)");
+  m.def("box_blur(Tensor indicator, int width, int times) -> Tensor");
+  m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
 
   // --- shade: light per pixel, from what the rasterizer blended to display values ---
   m.def(

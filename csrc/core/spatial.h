@@ -1,5 +1,6 @@
 // Questions about points and labels in space: the label of the nearest point of every voxel, the
-// two largest of many fields at a place, the nearest points among cells. Their use and every
+// two largest of many fields at a place, the nearest points among cells, sums over boxes of voxels,
+// noise between the nodes of lattices. Their use and every
 // formula: gsfluent/pipeline/partition and gsfluent/spatial/neighbours.py.
 //
 // Each number is rounded where torch, asked one operation at a time, rounds it, so that both back
@@ -287,6 +288,85 @@ struct NearestList {
 
 GSF_INLINE bool nearer(double away, int64_t row, double worst, int64_t last) {
   return away < worst || (away == worst && row < last);
+}
+
+// --- sums over boxes of voxels ---
+
+struct BoxSumArgs {
+  int64_t shape[3];
+  int half;  // voxels to each side
+  int axis;
+  const int32_t* in;
+  int32_t* out;
+
+  GSF_HOST_DEVICE int64_t voxels() const { return shape[0] * shape[1] * shape[2]; }
+  // Of the voxels within the grid; whole numbers, which no order changes.
+  GSF_HOST_DEVICE int32_t sum(int64_t voxel) const {
+    const int64_t stride = axis == 2 ? 1 : axis == 1 ? shape[2] : shape[1] * shape[2];
+    const int64_t at = voxel / stride % shape[axis];
+    const int64_t first = at < half ? -at : -half;
+    const int64_t last = at + half < shape[axis] ? half : shape[axis] - 1 - at;
+    int32_t total = 0;
+    for (int64_t k = first; k <= last; ++k) total += in[voxel + k * stride];
+    return total;
+  }
+};
+
+// --- value noise ---
+
+constexpr int kMostOctaves = 16;
+
+struct ValueNoiseArgs {
+  int64_t count;         // M
+  const int64_t* voxel;  // [M, 3]
+  int octaves;
+  double spacing[kMostOctaves];  // of the lattice's nodes [voxels]
+  double shift[kMostOctaves];    // of the lattice [spacings]
+  float weight[kMostOctaves];
+  float* noise;  // [M, 3]
+};
+
+// Three uniform values in -1 to 1 at a node of the lattice of an octave.
+GSF_INLINE void node_values(const int64_t* node, int octave, float* value) {
+  uint32_t h = (uint32_t(node[0]) * 0x8DA6B343u) ^ (uint32_t(node[1]) * 0xD8163841u) ^
+               (uint32_t(node[2]) * 0xCB1AB31Fu);
+  h ^= uint32_t(octave) * 0x9E3779B1u + 0x2545F491u;
+  constexpr uint32_t kTurns[3] = {0x7FEB352Du, 0x846CA68Bu, 0x9E3779B1u};
+  for (int axis = 0; axis < 3; ++axis) {
+    h = (h ^ (h >> 16)) * kTurns[axis];
+    h = (h ^ (h >> 15)) * 0x2C1B3C6Du;
+    value[axis] = float(double(h ^ (h >> 16)) * (2.0 / 4294967296.0) - 1.0);
+  }
+}
+
+GSF_INLINE void value_noise(const ValueNoiseArgs& a, int64_t i) {
+  float total[3] = {0.0f, 0.0f, 0.0f};
+  for (int octave = 0; octave < a.octaves; ++octave) {
+    int64_t base[3];
+    float share[3];
+    for (int axis = 0; axis < 3; ++axis) {
+      const double place = double(a.voxel[3 * i + axis]) / a.spacing[octave] + a.shift[octave];
+      const double low = floor(place);
+      const float t = float(place - low);
+      // what is nowhere has the noise of some node
+      base[axis] = low > -1e15 && low < 1e15 ? int64_t(low) : 0;
+      share[axis] = product(product(t, t), 3.0f - product(2.0f, t));
+    }
+    float corner[8][3];
+    for (int k = 0; k < 8; ++k) {
+      const int64_t node[3] = {base[0] + (k >> 2), base[1] + (k >> 1 & 1), base[2] + (k & 1)};
+      node_values(node, octave, corner[k]);
+    }
+    for (int c = 0; c < 3; ++c) {
+      float along[4], across[2];
+      for (int k = 0; k < 4; ++k)
+        along[k] = corner[k][c] + product(share[0], corner[k + 4][c] - corner[k][c]);
+      for (int k = 0; k < 2; ++k) across[k] = along[k] + product(share[1], along[k + 2] - along[k]);
+      const float value = across[0] + product(share[2], across[1] - across[0]);
+      total[c] += product(value, a.weight[octave]);
+    }
+  }
+  for (int c = 0; c < 3; ++c) a.noise[3 * i + c] = total[c];
 }
 
 }  // namespace gsf

@@ -74,6 +74,39 @@ struct SpatialCpu {
       }
     });
   }
+
+  static void box_sum(const BoxSumArgs& a, const Scope&) {
+    const int64_t rows = a.shape[1], row = a.shape[2], half = a.half;
+    // whole rows are added: neighbours in memory
+    const auto add = [](int32_t* out, const int32_t* in, int64_t count) {
+      for (int64_t z = 0; z < count; ++z) out[z] += in[z];
+    };
+    parallel_for(a.shape[0], 8, [&](int64_t begin, int64_t end) {
+      for (int64_t x = begin; x < end; ++x)
+        for (int64_t y = 0; y < rows; ++y) {
+          const int64_t here = (x * rows + y) * row;
+          int32_t* out = a.out + here;
+          std::copy(a.in + here, a.in + here + row, out);
+          const int64_t stride = a.axis == 0 ? rows * row : row;
+          const int64_t at = a.axis == 0 ? x : y, most = a.shape[a.axis] - 1;
+          for (int64_t k = 1; k <= half; ++k) {
+            if (a.axis == 2) {
+              add(out, a.in + here + k, row - k);
+              add(out + k, a.in + here, row - k);
+              continue;
+            }
+            if (at - k >= 0) add(out, a.in + here - k * stride, row);
+            if (at + k <= most) add(out, a.in + here + k * stride, row);
+          }
+        }
+    });
+  }
+
+  static void value_noise(const ValueNoiseArgs& a, const Scope&) {
+    parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::value_noise(a, i);
+    });
+  }
 };
 
 }  // namespace

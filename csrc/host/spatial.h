@@ -96,11 +96,63 @@ struct SpatialOps {
     return {square, index};
   }
 
+  static Tensor box_blur(Tensor indicator, int64_t width, int64_t times) {
+    const char* op = "box_blur";
+    indicator = ready(op, "indicator", indicator, indicator, {-1, -1, -1}, ScalarType::Int);
+    STD_TORCH_CHECK(width >= 1 && width <= 9 && width % 2 == 1, op,
+                    ": width must be odd and 1 to 9, got ", width);
+    STD_TORCH_CHECK(times >= 1 && times <= 3, op, ": times must be 1 to 3, got ", times);
+    const std::vector<int64_t> shape{indicator.size(0), indicator.size(1), indicator.size(2)};
+    // two grids in turn
+    Tensor grids[2] = {gsf::new_empty(indicator, shape, ScalarType::Int),
+                       gsf::new_empty(indicator, shape, ScalarType::Int)};
+    const typename Backend::Scope scope(indicator);
+    const int32_t* in = cptr<int32_t>(indicator);
+    int turn = 0;
+    for (int axis = 2; axis >= 0; --axis)
+      for (int64_t pass = 0; pass < times; ++pass) {
+        int32_t* out = mptr<int32_t>(grids[turn]);
+        const BoxSumArgs args{
+            {shape[0], shape[1], shape[2]}, static_cast<int>(width / 2), axis, in, out};
+        Backend::box_sum(args, scope);
+        in = out;
+        turn = 1 - turn;
+      }
+    return grids[1 - turn];
+  }
+
+  static Tensor value_noise(Tensor voxels, std::vector<double> spacings, std::vector<double> shifts,
+                            std::vector<double> weights) {
+    const char* op = "value_noise";
+    voxels = ready(op, "voxels", voxels, voxels, {-1, 3}, ScalarType::Long);
+    const size_t octaves = spacings.size();
+    STD_TORCH_CHECK(
+        octaves <= kMostOctaves && shifts.size() == octaves && weights.size() == octaves, op,
+        ": spacings, shifts and weights must be as many, at most ", kMostOctaves);
+    Tensor noise = gsf::new_empty(voxels, {voxels.size(0), 3}, ScalarType::Float);
+    ValueNoiseArgs args{};
+    args.count = voxels.size(0);
+    args.voxel = cptr<int64_t>(voxels);
+    args.octaves = static_cast<int>(octaves);
+    for (size_t k = 0; k < octaves; ++k) {
+      STD_TORCH_CHECK(spacings[k] > 0, op, ": spacings must be positive, got ", spacings[k]);
+      args.spacing[k] = spacings[k];
+      args.shift[k] = shifts[k];
+      args.weight[k] = static_cast<float>(weights[k]);
+    }
+    args.noise = mptr<float>(noise);
+    const typename Backend::Scope scope(voxels);
+    Backend::value_noise(args, scope);
+    return noise;
+  }
+
   template <typename Library>
   static void register_all(Library& m) {
     GSF_IMPL(SpatialOps, nearest_labels);
     GSF_IMPL(SpatialOps, largest_shares);
     GSF_IMPL(SpatialOps, nearest_in_cells);
+    GSF_IMPL(SpatialOps, box_blur);
+    GSF_IMPL(SpatialOps, value_noise);
   }
 
  private:

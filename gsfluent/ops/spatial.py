@@ -1,4 +1,4 @@
-"""Labels of voxels, the largest of many fields, the nearest of points among cells.
+"""Labels of voxels, the largest of many fields, the nearest of points among cells, sums, noise.
 
 What they are for: :mod:`gsfluent.pipeline.partition` and :mod:`gsfluent.spatial.neighbours`.
 """
@@ -16,6 +16,7 @@ from gsfluent._check import check_tensor
 from gsfluent.ops._register import fakes, no_gradient
 
 MOST_FIELDS = 32767
+MOST_OCTAVES = 16
 
 
 def nearest_labels(place: Tensor, rank: Tensor, shape: Sequence[int], radius: float) -> Tensor:
@@ -128,6 +129,72 @@ def nearest_in_cells(
     )
 
 
+def box_blur(indicator: Tensor, width: int, times: int = 3) -> Tensor:
+    """How often each voxel is counted by passes of a box along every axis.
+
+    What a pass sums beyond the grid is dropped before the next one.
+
+    Args:
+        indicator: 0 and 1, bool [X, Y, Z]; outside of the grid is 0.
+        width: Odd width of the box [voxels], 1 to 9.
+        times: Passes along each axis, 1 to 3.
+
+    Returns:
+        int32 [X, Y, Z], at most ``width^(3 times)``.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: The shape, the width or the number of passes is wrong.
+
+    Gradient: none.
+    """
+    op = "box_blur"
+    check_tensor(op, "indicator", indicator, shape=("X", "Y", "Z"), dtype=torch.bool)
+    if width % 2 == 0 or not 1 <= width <= 9:
+        raise ValueError(f"{op}: width must be odd and 1 to 9, got {width}")
+    if not 1 <= times <= 3:
+        raise ValueError(f"{op}: times must be 1 to 3, got {times}")
+    return torch.ops.gsfluent.box_blur.default(indicator.to(torch.int32), width, times)
+
+
+def value_noise(
+    voxels: Tensor, spacings: Sequence[float], shifts: Sequence[float], weights: Sequence[float]
+) -> Tensor:
+    """Sum of octaves of value noise, three values at each voxel.
+
+    The nodes of an octave's lattice have hashed values, uniform in -1 to 1, between which
+    smoothsteps blend along one axis after the other. A hash knows its octave's number.
+
+    Args:
+        voxels: int64 [M, 3].
+        spacings: Of each octave's nodes [voxels], positive; at most 16 octaves.
+        shifts: Of each octave's lattice [spacings].
+        weights: Of each octave.
+
+    Returns:
+        float32 [M, 3].
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape is wrong, the lists are not as long as each other, or a spacing is not
+            positive.
+
+    Gradient: none.
+    """
+    op = "value_noise"
+    check_tensor(op, "voxels", voxels, shape=("M", 3), dtype=torch.int64)
+    if not len(spacings) == len(shifts) == len(weights) <= MOST_OCTAVES:
+        lengths = ", ".join(str(len(part)) for part in (spacings, shifts, weights))
+        raise ValueError(
+            f"{op}: spacings, shifts and weights must be as many, at most {MOST_OCTAVES}, "
+            f"got {lengths}"
+        )
+    if not all(math.isfinite(s) and s > 0.0 for s in spacings):
+        raise ValueError(f"{op}: spacings must be positive, got {list(spacings)}")
+    lists = ([float(v) for v in part] for part in (spacings, shifts, weights))
+    return torch.ops.gsfluent.value_noise.default(voxels, *lists)
+
+
 def _check_shape(op: str, shape: Sequence[int]) -> None:
     if len(shape) != 3 or any(n < 0 for n in shape):
         raise ValueError(f"{op}: shape must be three sizes, got {tuple(shape)}")
@@ -153,5 +220,10 @@ fakes(
         queries.new_empty((queries.shape[0], count)),
         queries.new_empty((queries.shape[0], count), dtype=torch.int64),
     ),
+    box_blur=lambda indicator, width, times: indicator.new_empty(indicator.shape),
+    value_noise=lambda voxels, *rest: voxels.new_empty(voxels.shape, dtype=torch.float32),
 )
-no_gradient("spatial: no gradient", "nearest_labels", "largest_shares", "nearest_in_cells")
+no_gradient(
+    "spatial: no gradient",
+    "nearest_labels", "largest_shares", "nearest_in_cells", "box_blur", "value_noise",
+)  # fmt: skip

@@ -11,6 +11,9 @@ from torch import Tensor
 from gsfluent import ops
 
 _SIDE = 1 << 20  # cells along an axis that a key can tell apart
+_NEAR = 3.0  # cells around the queries within which points are looked at first
+_FEW = 8  # times as many points as queries, from which that pays
+_ROOMS = 1 << 21  # cells that are marked, at most
 
 
 def nearest(
@@ -66,6 +69,20 @@ def nearest_rows(points: Tensor, queries: Tensor, count: int, cell: float) -> tu
     Raises:
         ValueError: As :func:`nearest`.
     """
+    some = _around(points, queries, _NEAR * cell)
+    if some is None or len(some) < count:
+        return _nearest_rows(points, queries, count, cell)
+    distance, index = _nearest_rows(points[some], queries, count, cell)
+    index = some[index]
+    far = (distance[:, -1] > _NEAR * cell).nonzero()[:, 0]
+    if len(far):
+        distance[far], index[far] = _nearest_rows(points, queries[far], count, cell)
+    return distance, index
+
+
+def _nearest_rows(
+    points: Tensor, queries: Tensor, count: int, cell: float
+) -> tuple[Tensor, Tensor]:
     if points.device.type == "cpu":
         found = nearest(points, queries.detach().double().numpy(), count, cell)
         distance, index = (torch.from_numpy(part) for part in found)
@@ -74,6 +91,33 @@ def nearest_rows(points: Tensor, queries: Tensor, count: int, cell: float) -> tu
             points.detach().double(), queries.detach().double(), count, cell
         )
     return _in_order(distance, index.to(torch.int64))
+
+
+def _around(points: Tensor, queries: Tensor, margin: float) -> Tensor | None:
+    """Rows of the points that are within a margin of any query, and some more, in their order.
+
+    None where asking all of them costs no more.
+    """
+    if len(points) < _FEW * len(queries) or not len(queries) or not 0.0 < margin < math.inf:
+        return None
+    asked = queries.detach().double()
+    low, high = asked.amin(0) - margin, asked.amax(0) + margin
+    extent = (high - low).tolist()
+    if not all(math.isfinite(side) for side in extent):
+        return None
+    edge = margin
+    while math.prod(math.floor(side / edge) + 1 for side in extent) > _ROOMS:
+        edge *= 1.5
+    size = [math.floor(side / edge) + 1 for side in extent]
+    marked = torch.zeros(size, dtype=torch.float32, device=points.device)
+    marked[((asked - low) / edge).long().unbind(1)] = 1.0
+    # what is within an edge is in the same room or in one beside it
+    near = torch.nn.functional.max_pool3d(marked[None, None], 3, 1, 1)[0, 0] > 0.0
+    room = ((points.detach().double() - low) / edge).floor().long()
+    most = torch.tensor(size, device=points.device) - 1
+    within = ((room >= 0) & (room <= most)).all(dim=1)
+    x, y, z = torch.minimum(room.clamp(min=0), most).unbind(1)
+    return (within & near[x, y, z]).nonzero()[:, 0]
 
 
 def nearest_in_group(
@@ -103,6 +147,31 @@ def nearest_in_group(
         Distances float64 [M, count], ascending, infinite where a group has too few points within
         reach, and rows int64 [M, count], -1 there.
     """
+    some = _around(points, queries, _NEAR * cell)
+    if some is None:
+        return _nearest_in_group(points, group, queries, wanted, count, cell, reach)
+    distance, index = _nearest_in_group(
+        points[some], group[some], queries, wanted, count, cell, min(reach, _NEAR * cell)
+    )
+    index = torch.where(index < 0, index, some[index.clamp(min=0)]) if len(some) else index
+    if reach > _NEAR * cell:
+        far = distance[:, -1].isinf().nonzero()[:, 0]
+        if len(far):
+            distance[far], index[far] = _nearest_in_group(
+                points, group, queries[far], wanted[far], count, cell, reach
+            )
+    return distance, index
+
+
+def _nearest_in_group(
+    points: Tensor,
+    group: Tensor,
+    queries: Tensor,
+    wanted: Tensor,
+    count: int,
+    cell: float,
+    reach: float,
+) -> tuple[Tensor, Tensor]:
     distance = torch.full((len(queries), count), math.inf, dtype=torch.float64)
     distance = distance.to(points.device)
     index = torch.full_like(distance, -1, dtype=torch.int64)

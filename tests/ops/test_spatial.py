@@ -1,4 +1,7 @@
-"""Labels of voxels, the largest of many fields, the nearest points: against tables of all pairs."""
+"""Labels of voxels, the largest of many fields, the nearest points: against tables of all pairs.
+
+Sums over boxes and value noise: against their references, bit by bit.
+"""
 
 from __future__ import annotations
 
@@ -149,3 +152,49 @@ def test_arguments_that_fit_nothing_are_refused() -> None:
         ops.nearest_in_cells(place, place, rank, rank[:1], rank[:0], [0.0] * 3, 1.0, 0)
     with pytest.raises(ValueError, match="start"):
         ops.nearest_in_cells(place, place, rank, rank, rank[:0], [0.0] * 3, 1.0, 1)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("shape", [(11, 9, 14), (1, 1, 1), (2, 40, 3), (0, 3, 3)])
+@pytest.mark.parametrize(("width", "times"), [(1, 3), (3, 1), (5, 2), (9, 3)])
+def test_a_box_counts_what_it_holds(
+    device: str, shape: tuple[int, int, int], width: int, times: int
+) -> None:
+    held = torch.rand(shape, generator=draw(5)) < 0.6
+    got = ops.box_blur(held.to(device), width, times)
+    assert torch.equal(got.cpu(), reference.box_blur(held, width, times))
+
+
+def test_the_count_of_a_full_box_is_its_volume() -> None:
+    got = ops.box_blur(torch.ones(30, 30, 30, dtype=torch.bool), 9)
+    assert int(got[15, 15, 15]) == int(got.max()) == 9**9
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_value_noise_rounds_alike_everywhere(device: str) -> None:
+    voxels = torch.randint(-5000, 5000, (4000, 3), generator=draw(6))
+    voxels[:50] = torch.cartesian_prod(torch.arange(50), torch.arange(1), torch.arange(1))
+    given = [48.0, 3.0, 1.5], [0.37, -0.74, 1.11], [1.0, 0.3, 0.111]
+    got = ops.value_noise(voxels.to(device), *given)
+    assert torch.equal(got.cpu(), reference.value_noise(voxels, *given))
+    assert float(got.abs().max()) <= 1.411 and float(got.mean().abs()) < 0.02
+    nowhere = torch.tensor([[2**62, -(2**62), 0]], device=device)
+    assert bool(torch.isfinite(ops.value_noise(nowhere, *given)).all())
+    assert ops.value_noise(voxels[:0], [], [], []).shape == (0, 3)
+
+
+def test_boxes_and_noise_say_what_is_wrong() -> None:
+    held, voxels = torch.ones(3, 3, 3, dtype=torch.bool), torch.zeros(2, 3, dtype=torch.int64)
+    for width in (0, 4, 11):
+        with pytest.raises(ValueError, match="width must be odd"):
+            ops.box_blur(held, width)
+    with pytest.raises(ValueError, match="times must be 1 to 3"):
+        ops.box_blur(held, 3, 4)
+    with pytest.raises(TypeError, match="indicator"):
+        ops.box_blur(held.int(), 3)
+    with pytest.raises(ValueError, match="as many"):
+        ops.value_noise(voxels, [1.0], [0.0, 0.0], [1.0])
+    with pytest.raises(ValueError, match="positive"):
+        ops.value_noise(voxels, [0.0], [0.0], [1.0])
+    torch.library.opcheck(torch.ops.gsfluent.box_blur.default, (held.int(), 3, 3))
+    torch.library.opcheck(torch.ops.gsfluent.value_noise.default, (voxels, [2.0], [0.0], [1.0]))

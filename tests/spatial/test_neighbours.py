@@ -101,3 +101,27 @@ def test_groups_are_searched_within_reach_alone(device: str) -> None:
     assert bool((whole < 0.25).any()) and bool((whole > 0.25).any())
     assert torch.equal(distance, torch.where(whole <= 0.25, whole, torch.inf))
     assert torch.equal(index, torch.where(whole <= 0.25, every, -1))
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("spread", [0.01, 0.5, 4.0, 1e6])
+def test_few_queries_find_what_many_find(spread: float, device: str) -> None:
+    """Only points near them are asked first; some have to ask all."""
+    make = torch.Generator().manual_seed(5)
+    points = torch.rand(4000, 3, generator=make)
+    queries = 0.5 + spread * (torch.rand(40, 3, generator=make) - 0.5)
+    group = torch.arange(4000) % 3
+    asked = torch.cat([queries, torch.rand(2000, 3, generator=make)])  # too many to choose
+    wanted = torch.arange(2040) % 4  # there is no group 3
+    for count in (1, 7):
+        everywhere = nearest_rows(points.to(device), asked.to(device), count, 0.02)
+        here = nearest_rows(points.to(device), queries.to(device), count, 0.02)
+        for whole, some in zip(everywhere, here, strict=True):
+            assert torch.equal(some, whole[:40])
+        for reach in (0.03, 0.5, float("inf")):
+            given = [x.to(device) for x in (points, group, asked, wanted)]
+            everywhere = nearest_in_group(*given, count, 0.02, reach)
+            few = [x[:40] if n > 1 else x for n, x in enumerate(given)]
+            here = nearest_in_group(*few, count, 0.02, reach)
+            for whole, some in zip(everywhere, here, strict=True):
+                assert torch.equal(some, whole[:40])

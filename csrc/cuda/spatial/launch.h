@@ -10,5 +10,7 @@ namespace gsf::cuda {
 cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream);
 cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream);
 cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream);
+cudaError_t box_sum(const BoxSumArgs& a, cudaStream_t stream);
+cudaError_t value_noise(const ValueNoiseArgs& a, cudaStream_t stream);
 
 }  // namespace gsf::cuda

@@ -11,6 +11,8 @@ struct SpatialCuda {
   GSF_LAUNCH(nearest_labels)
   GSF_LAUNCH(largest_shares)
   GSF_LAUNCH(nearest_in_cells)
+  GSF_LAUNCH(box_sum)
+  GSF_LAUNCH(value_noise)
 };
 
 }  // namespace

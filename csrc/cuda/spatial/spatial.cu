@@ -119,6 +119,16 @@ __global__ void nearest_in_cells_kernel(NearestInCellsArgs a) {
   }
 }
 
+__global__ void box_sum_kernel(BoxSumArgs a) {
+  const int64_t k = thread_number();
+  if (k < a.voxels()) a.out[k] = a.sum(k);
+}
+
+__global__ void value_noise_kernel(ValueNoiseArgs a) {
+  const int64_t i = thread_number();
+  if (i < a.count) gsf::value_noise(a, i);
+}
+
 }  // namespace
 
 cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream) {
@@ -136,6 +146,16 @@ cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream) {
 
 cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream) {
   if (a.count) nearest_in_cells_kernel<<<blocks_for(32 * a.count), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+cudaError_t box_sum(const BoxSumArgs& a, cudaStream_t stream) {
+  if (a.voxels()) box_sum_kernel<<<blocks_for(a.voxels()), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+cudaError_t value_noise(const ValueNoiseArgs& a, cudaStream_t stream) {
+  if (a.count) value_noise_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);
   return cudaGetLastError();
 }
 

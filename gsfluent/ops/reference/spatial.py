@@ -1,4 +1,4 @@
-"""Reference of the spatial operators: whole tables, one operation at a time."""
+"""Reference of the spatial operators: whole tables and grids, one operation at a time."""
 
 from __future__ import annotations
 
@@ -70,3 +70,53 @@ def nearest_in_cells(
     best, rows = square.sort(dim=1, stable=True)
     best, rows = best[:, :count], rows[:, :count]
     return best, torch.where(best.isfinite(), rows, 0)
+
+
+def box_blur(indicator: Tensor, width: int, times: int = 3) -> Tensor:
+    """As :func:`gsfluent.ops.box_blur`, by differences of running sums."""
+    field, half = indicator.to(torch.int64), width // 2
+    for axis in (2, 1, 0):
+        count = field.shape[axis]
+        place = torch.arange(count)
+        last, first = (place + half).clamp(max=count - 1) + 1, (place - half).clamp(min=0)
+        for _ in range(times):
+            before = torch.zeros_like(field.narrow(axis, 0, min(1, count)))
+            total = torch.cat([before, field.cumsum(axis)], dim=axis)
+            field = total.index_select(axis, last) - total.index_select(axis, first)
+    return field.to(torch.int32)
+
+
+_MASK = 0xFFFFFFFF
+
+
+def value_noise(
+    voxels: Tensor, spacings: Sequence[float], shifts: Sequence[float], weights: Sequence[float]
+) -> Tensor:
+    """As :func:`gsfluent.ops.value_noise`, octave by octave."""
+    total = torch.zeros(voxels.shape, dtype=torch.float32)
+    for octave, (spacing, shift, weight) in enumerate(zip(spacings, shifts, weights, strict=True)):
+        place = voxels.double() / spacing + shift
+        base = place.floor()
+        t = (place - base).float()
+        share = t * t * (3.0 - 2.0 * t)
+        corners = torch.cartesian_prod(*[torch.arange(2)] * 3)
+        value = _hashed(base.long()[:, None] + corners, octave).view(-1, 2, 2, 2, 3)
+        for axis in range(3):
+            near, far = value.unbind(dim=1)
+            by = share[:, axis].view(-1, *[1] * (near.ndim - 1))
+            value = near + by * (far - near)
+        total = total + value * weight
+    return total
+
+
+def _hashed(node: Tensor, octave: int) -> Tensor:
+    """Three uniform values in -1 to 1 at nodes [..., 3] of a lattice."""
+    x, y, z = node.unbind(dim=-1)
+    h = ((x * 0x8DA6B343) & _MASK) ^ ((y * 0xD8163841) & _MASK) ^ ((z * 0xCB1AB31F) & _MASK)
+    h = h ^ ((octave * 0x9E3779B1 + 0x2545F491) & _MASK)
+    parts = []
+    for turn in (0x7FEB352D, 0x846CA68B, 0x9E3779B1):
+        h = ((h ^ (h >> 16)) * turn) & _MASK
+        h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & _MASK
+        parts.append((h ^ (h >> 16)).to(torch.float64) * (2.0 / 4294967296.0) - 1.0)
+    return torch.stack(parts, dim=-1).to(torch.float32)

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
-from torch.nn import functional
+
+from gsfluent import ops
 
 TIMES = 3
 """Box filters that make one blur."""
-_SMALL = 32767  # largest int16
 
 
 def box_width(sigma: float) -> int:
@@ -41,34 +40,4 @@ def blur(indicator: Tensor, width: int) -> Tensor:
     Raises:
         ValueError: The width is even, or its sums do not fit.
     """
-    if width % 2 == 0 or not 1 <= width <= 9:
-        raise ValueError(f"blur: width must be odd and 1 to 9, got {width}")
-    field, most = indicator.to(torch.int16), 1
-    for axis in (2, 1, 0):
-        for _ in range(TIMES):
-            most *= width
-            if most > _SMALL:
-                field = field.to(torch.int32)
-            field = _window(field, width, axis)
-    return field.to(torch.int32)
-
-
-def _window(field: Tensor, width: int, axis: int) -> Tensor:
-    """Sums over ``width`` neighbours along an axis, by doubling."""
-    count, half = field.shape[axis], width // 2
-    pad = [0] * 6
-    pad[4 - 2 * axis] = pad[5 - 2 * axis] = half
-    part = functional.pad(field, pad)
-    total, start, size = None, 0, 1
-    while True:
-        if width & size:
-            piece = part.narrow(axis, start, count)
-            total = piece if total is None else total + piece
-            start += size
-        if 2 * size > width:
-            break
-        length = part.shape[axis] - size
-        part = part.narrow(axis, 0, length) + part.narrow(axis, size, length)
-        size *= 2
-    assert total is not None  # width is at least 1
-    return total
+    return ops.box_blur(indicator, width, TIMES)

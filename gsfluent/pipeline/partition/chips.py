@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -137,28 +138,28 @@ def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     spread = square.double() / many[..., None] - middle[:, :, None] * middle[:, None]
     seed = (total[:, 0] * 0x8DA6B343) ^ (total[:, 1] * 0xD8163841) ^ (total[:, 2] * 0xCB1AB31F)
     seed = (seed ^ (count * 0x9E3779B1)) & _MASK
-    turn = _turns(torch.stack([hashed(seed, n) for n in range(4)], dim=1))
+    turn = _turns(hashes(seed, range(4)))
     base = torch.tensor(_PLANES, dtype=torch.float64, device=device)
     parts = []
     for axis in range(3):  # turned, one product at a time
         row = turn[:, axis, :, None] * base.T
         parts.append(row[:, 0] + row[:, 1] + row[:, 2])
     normal = torch.stack(parts, dim=2)
-    planes = range(len(_PLANES))
-    tilt = [[hashed(seed, 8 + 3 * p + axis) for axis in range(3)] for p in planes]
-    normal = normal + TILT * torch.stack([torch.stack(t, dim=1) for t in tilt], dim=1)
+    planes = len(_PLANES)
+    tilt = hashes(seed, range(8, 8 + 3 * planes)).view(-1, planes, 3)
+    normal = normal + TILT * tilt
     x, y, z = normal.unbind(dim=2)
     normal = normal / (x * x + y * y + z * z).sqrt()[..., None]
     normal = _stretched(normal, spread)
     x, y, z = normal.unbind(dim=2)
     length = (x * x + y * y + z * z).sqrt()
     normal, reach = normal / length[..., None], 1.0 / length
-    shift = torch.stack([hashed(seed, 64 + p) for p in planes], dim=1)
+    shift = hashes(seed, range(64, 64 + planes))
     # half of the corners are not cut
-    far = torch.stack([(p >= _SIDES) & (hashed(seed, 96 + p) < 0.0) for p in planes], dim=1)
+    corner = torch.arange(planes, device=device) >= _SIDES
+    far = corner & (hashes(seed, range(96, 96 + planes)) < 0.0)
     # opposite sides go out together: some boxes are slabs, some are rods
-    wide = torch.stack([hashed(seed, 112 + min(p, _SIDES) // 2) for p in planes], dim=1)
-    wide = 1.0 + FLAT * wide
+    wide = 1.0 + FLAT * hashes(seed, [112 + min(p, _SIDES) // 2 for p in range(planes)])
     return middle, normal, reach * torch.where(far, _AWAY, wide * (1.0 + UNEVEN * shift))
 
 
@@ -182,8 +183,14 @@ def _stretched(normal: Tensor, spread: Tensor) -> Tensor:
 
 
 def hashed(seed: Tensor, turn: int) -> Tensor:
-    """Uniform values in -1 to 1, float64, from whole numbers below 2^32 of any shape."""
-    h = (seed ^ ((turn * 0x9E3779B1 + 0x2545F491) & _MASK)) & _MASK
+    """One of :func:`hashes`, of the shape of ``seed``."""
+    return hashes(seed, [turn])[..., 0]
+
+
+def hashes(seed: Tensor, turns: Sequence[int]) -> Tensor:
+    """Uniform values in -1 to 1, float64, from whole numbers below 2^32, [..., turns]."""
+    salt = [(turn * 0x9E3779B1 + 0x2545F491) & _MASK for turn in turns]
+    h = (seed[..., None] ^ torch.tensor(salt, device=seed.device)) & _MASK
     for factor in (0x7FEB352D, 0x846CA68B):
         h = ((h ^ (h >> 16)) * factor) & _MASK
     h = h ^ (h >> 16)

@@ -136,7 +136,7 @@ def displaced(
         Voxels near a face, int64 [M, 3], and their labels, each [M].
     """
     near = ((smooth.second >= 0) & (smooth.lead < _CLEAR)).nonzero()
-    shift = displacements(near, low, smooth.first.shape)
+    shift = displacements(near + torch.tensor(low, device=near.device))
     place = near.to(torch.float32) + shift * amplitude
     first, second, lead = ops.largest_shares(place, smooth.first.shape, found.shares, found.box)
     # displaced out of every field: what it was
