@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -220,6 +222,25 @@ def trilinear(grid: Tensor, place: Tensor) -> Tensor:
             for c, w in axes[2]:
                 total += (share * w).to(grid) * flat.index_select(0, corner + c)
     return total
+
+
+def ascending(values: Tensor) -> Tensor:
+    """Values sorted along their first axis, [N, ...].
+
+    On a CPU by NumPy, whose vector instructions take a tenth to a twentieth of ``Tensor.sort``.
+    """
+    if values.device.type != "cpu" or values.requires_grad:
+        return values.sort(0).values
+    return torch.from_numpy(np.sort(values.numpy(), axis=0))
+
+
+def quantiles(values: Tensor, shares: Sequence[float]) -> Tensor:
+    """What ``torch.quantile(values, shares, dim=0)`` gives for finite float64 values, [S, ...]."""
+    ordered = ascending(values)
+    place = torch.tensor(shares, dtype=torch.float64) * (len(ordered) - 1)
+    low = place.floor()
+    weight = (place - low).reshape(-1, *[1] * (values.dim() - 1)).expand(-1, *values.shape[1:])
+    return torch.lerp(ordered[low.long()], ordered[place.ceil().long()], weight.to(values))
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:

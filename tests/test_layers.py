@@ -27,7 +27,7 @@ ORDER = (
     "demo io posing "
     "scene figure config/yaml_file.py config config/physgaussian results "
     "pipeline/__init__.py pipeline/stage.py pipeline/carrying pipeline/capture "
-    "pipeline/matter pipeline/liquid "
+    "pipeline/matter pipeline/heat pipeline/liquid "
     "pipeline/colliders "
     "pipeline/light pipeline/solid pipeline/reconstruct pipeline/regions pipeline/fill "
     "pipeline/texture/volume pipeline/texture/presets pipeline/texture/photo "

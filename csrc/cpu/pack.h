@@ -52,6 +52,7 @@ struct Pack {
   friend Int operator<=(Pack a, Pack b) { return a.v <= b.v; }
   friend Int operator>(Pack a, Pack b) { return a.v > b.v; }
   friend Int operator>=(Pack a, Pack b) { return a.v >= b.v; }
+  friend Int operator==(Pack a, Pack b) { return a.v == b.v; }
 };
 
 template <typename T>

@@ -23,7 +23,7 @@ from gsfluent.config.read import (
     vector,
     whole,
 )
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, short
 
 Vector = tuple[float, float, float]
 
@@ -162,6 +162,7 @@ class ObjectSettings:
     material: str = "fruit.watermelon"
     overrides: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     parts: tuple[Part, ...] | None = None
+    temperature: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for run.json."""
@@ -172,6 +173,8 @@ class ObjectSettings:
             "material": self.material,
             **plain(self.overrides),
             "parts": parts,
+            # as it was before there was heat, where none is named
+            **({} if self.temperature is None else {"temperature": self.temperature}),
         }
 
 
@@ -187,10 +190,14 @@ def _object(name: str, value: Any, place: Place) -> ObjectSettings:
     from gsfluent import materials
 
     settings = mapping(value, place)
-    _refuse_parameters(settings, ("select", "material", "parts", *materials.WHOLE), place)
+    own = ("select", "material", "parts", "temperature", *materials.WHOLE)
+    _refuse_parameters(settings, own, place)
     material = text(settings.pop("material", "fruit.watermelon"), place.inside("material"))
     select = _select(settings.pop("select", "all"), place.inside("select"))
     parts = settings.pop("parts", None)
+    warm = settings.pop("temperature", None)
+    if warm is not None:
+        warm = _temperature(material, warm, place.inside("temperature"))
     overrides = _parameters(material, settings, place)
     return ObjectSettings(
         name,
@@ -198,7 +205,22 @@ def _object(name: str, value: Any, place: Place) -> ObjectSettings:
         material,
         overrides,
         None if parts is None else _parts(material, overrides, parts, place.inside("parts")),
+        warm,
     )
+
+
+def _temperature(material: str, value: Any, place: Place) -> float:
+    """Read the temperature of an object that can melt."""
+    from gsfluent.materials.heat import thermal
+
+    degrees: float = number(-273.15)(value, place)
+    try:
+        thermal(material)
+    except InputError as error:
+        raise InputError(
+            f"{place.path}: nothing is known of the heat of {short(material)}", error.hint
+        ) from None
+    return degrees
 
 
 def _select(value: Any, place: Place) -> Select:

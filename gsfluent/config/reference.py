@@ -13,6 +13,7 @@ from gsfluent.config.objects import Select, Where
 from gsfluent.config.read import key_name, plain
 from gsfluent.config.settings import (
     FillSettings,
+    HeatSettings,
     OutputSettings,
     PhotoSettings,
     ReconstructSettings,
@@ -27,6 +28,7 @@ from gsfluent.config.settings_light import (
 )
 from gsfluent.config.settings_solve import SolveSettings
 from gsfluent.config.shot import Shot
+from gsfluent.materials.heat import THERMAL
 
 SECTIONS: dict[str, type[Any]] = {
     "(top level)": Shot,
@@ -39,6 +41,7 @@ SECTIONS: dict[str, type[Any]] = {
     "objects.NAME.parts[].where": Where,
     **{f"events[] with type: {name}": cls for name, cls in EVENTS.items()},
     **{f"colliders[] with type: {name}": cls for name, cls in COLLIDERS.items()},
+    "heat": HeatSettings,
     "solve": SolveSettings,
     "light": LightSettings,
     "light.key": KeyLight,
@@ -72,7 +75,9 @@ def parameters() -> str:
     return (
         f"{words}, "
         + ", ".join(f"`{name}`" for name in names)
-        + f".\nOf an object only, as its parts share them: {whole}.\n"
+        + f".\nOf an object only, as its parts share them: {whole}, and "
+        "`temperature` at the start [degrees C], with which it softens, melts and freezes "
+        f"([heat](heat.md)): of {', '.join(f'`{name}`' for name in THERMAL)}.\n"
     )
 
 

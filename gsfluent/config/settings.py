@@ -111,6 +111,31 @@ class ReconstructSettings(Section):
 
 
 @dataclasses.dataclass(frozen=True)
+class HeatSettings(Section):
+    """``heat:`` - what is around objects that have a temperature."""
+
+    air: float = key(number(-273.15), "Temperature of the air [degrees C].", "-10", default=20.0)
+    transfer: float = key(
+        number(0.0),
+        "Heat that the air gives or takes [W/(m^2 K)]; 5 to 10 when it is still, 0 for none.",
+        "50",
+        default=10.0,
+    )
+    floor: float | None = optional(
+        number(-273.15),
+        "Temperature of the floor [degrees C]; it lets no heat through when absent.",
+        "60",
+    )
+    speed: float = key(
+        number(0.0),
+        "How many times faster heat flows than things move: ice melts in an hour, a film has "
+        "seconds.",
+        "100",
+        default=1.0,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class FillSettings(Section):
     """``fill:`` - a shell of splats to a solid."""
 

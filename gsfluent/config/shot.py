@@ -32,6 +32,7 @@ from gsfluent.config.read import (
 )
 from gsfluent.config.settings import (
     FillSettings,
+    HeatSettings,
     OutputSettings,
     ReconstructSettings,
     TextureSettings,
@@ -149,6 +150,11 @@ class Shot:
         "[{type: sphere, at: [0, 0, 0.1], radius: 0.1}]",
         default=(),
     )
+    heat: HeatSettings | None = optional(
+        nested(HeatSettings),
+        "What is around objects that have a temperature (objects.NAME.temperature).",
+        "{floor: 60, speed: 100}",
+    )
     solve: SolveSettings = key(
         read_solve, "How accurately.", "{quality: preview}", default=SolveSettings()
     )
@@ -199,6 +205,13 @@ class Shot:
             _refuse_photographs(shot.objects)
         if not shot.objects:
             shot = dataclasses.replace(shot, objects={"object": ObjectSettings("object")})
+        if shot.heat is not None and all(o.temperature is None for o in shot.objects.values()):
+            raise InputError(
+                "heat: does nothing where no object has a temperature",
+                "give objects.NAME.temperature, or remove the section",
+            )
+        if shot.floor == "none" and shot.heat is not None and shot.heat.floor is not None:
+            raise InputError("heat.floor does nothing without a floor", "drop it")
         if shot.floor == "none" and (shot.floor_mode, shot.floor_friction) != ("separate", 0.4):
             raise InputError(
                 "floor_mode and floor_friction do nothing without a floor", "drop them"

@@ -23,6 +23,7 @@ class Thermal:
         melting_point: Where melting begins [degrees C].
         melting_range: How far above it ends [K].
         latent_heat: What it takes [J/kg].
+        viscosity: Of the melt [Pa s].
         source: Where the numbers are from.
     """
 
@@ -33,6 +34,7 @@ class Thermal:
     melting_point: float
     melting_range: float
     latent_heat: float
+    viscosity: float
     source: str
 
     def row(self) -> Tensor:
@@ -42,18 +44,19 @@ class Thermal:
 
 THERMAL: dict[str, Thermal] = {
     "ice": Thermal(
-        2.2, 0.57, 2050.0, 4200.0, 0.0, 0.0, 3.34e5,
+        2.2, 0.57, 2050.0, 4200.0, 0.0, 0.0, 3.34e5, 1.8e-3,
         "measured: handbook, ice and water near 0 degrees C (CRC Handbook)",
     ),
     "chocolate": Thermal(
-        0.25, 0.21, 1600.0, 1700.0, 28.0, 6.0, 4.5e4,
+        0.25, 0.21, 1600.0, 1700.0, 28.0, 6.0, 4.5e4, 3.0,
         "derived: a third of cocoa butter of 150 J/g, which melts from 28 to 34 degrees C as form "
-        "V (Beckett, Science of Chocolate); conductivity and capacity estimates from its parts",
+        "V (Beckett, Science of Chocolate); conductivity and capacity estimates from its parts; "
+        "viscosity of the molten, 1 to 20 Pa s (the same book)",
     ),
     "wax": Thermal(
-        0.24, 0.15, 2100.0, 2400.0, 52.0, 6.0, 1.9e5,
+        0.24, 0.15, 2100.0, 2400.0, 52.0, 6.0, 1.9e5, 5e-3,
         "measured: paraffin wax, melting 52 to 58 degrees C, 170 to 210 J/g (tables of heat "
-        "stores, e.g. Zalba et al. 2003)",
+        "stores, e.g. Zalba et al. 2003); viscosity estimate, a few mPa s above 60 degrees C",
     ),
 }  # fmt: skip
 """Name -> thermal properties."""

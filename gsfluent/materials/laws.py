@@ -34,6 +34,9 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "yield_stress": (0.0, math.inf, "Pa"),
     "hardening_modulus": (-math.inf, math.inf, "Pa"),
     "plastic_viscosity": (0.0, math.inf, "Pa s"),
+    "hardening_exponent": (0.0, 1.0, "no unit"),
+    "rate_sensitivity": (0.0, 1.0, "no unit"),
+    "melting_heat": (0.0, math.inf, "J/m^3"),
     "cohesion_pressure": (0.0, math.inf, "Pa"),
     "bulk_modulus": (0.0, math.inf, "Pa"),
     "viscosity": (0.0, math.inf, "Pa s"),
@@ -86,6 +89,9 @@ PARAMETERS = tuple(RANGES)
 RELAXATION = ("relaxation_share", "relaxation_time")
 """What makes matter relax, both together or not at all."""
 
+JOHNSON_COOK = ("hardening_exponent", "rate_sensitivity", "melting_heat")
+"""What makes metal harden by a power and by its rate, and soften by its own heat."""
+
 _SOLID = ("young_modulus", "poisson_ratio", "density")
 READS: dict[str, tuple[str, ...]] = {
     "elastic": (*_SOLID, *RELAXATION),
@@ -102,7 +108,13 @@ READS: dict[str, tuple[str, ...]] = {
         "yield_time",
     ),
     "drucker_prager": (*_SOLID, "friction_angle", "cohesion_pressure"),
-    "von_mises": (*_SOLID, "yield_stress", "hardening_modulus", "plastic_viscosity"),
+    "von_mises": (
+        *_SOLID,
+        "yield_stress",
+        "hardening_modulus",
+        "plastic_viscosity",
+        *JOHNSON_COOK,
+    ),
     "fluid": ("bulk_modulus", "density", "viscosity", "tait_exponent"),
     "rigid": ("density",),
     "yeoh": (*_SOLID, "yeoh_c20", "yeoh_c30"),
@@ -134,7 +146,11 @@ DEFAULTS: dict[str, dict[str, float]] = {
         "shear_damage": 0.0,
     },
     "drucker_prager": {"friction_angle": 35.0, "cohesion_pressure": 0.0},
-    "von_mises": {"hardening_modulus": 0.0, "plastic_viscosity": 0.0},
+    "von_mises": {
+        "hardening_modulus": 0.0,
+        "plastic_viscosity": 0.0,
+        **dict.fromkeys(JOHNSON_COOK, 0.0),
+    },
     "fluid": {"viscosity": 0.0, "tait_exponent": 7.0},
     "ogden": {"ogden_mu2": 0.0, "ogden_alpha2": 2.0, "ogden_mu3": 0.0, "ogden_alpha3": 2.0},
 }
@@ -146,6 +162,8 @@ def unstable(law: str, row: Tensor) -> str:
     mu, _, strength, cohesion, hardening, damage, _, exponent = row.unbind(dim=-1)
     if law == "von_mises" and bool((hardening <= -3.0 * mu).any()):
         return "hardening_modulus must be above -3 times the shear modulus"
+    if law == "von_mises" and bool(((exponent > 0.0) & (hardening < 0.0)).any()):
+        return "hardening_modulus must not be below 0 with an exponent, a rate or a heat"
     if law == "yeoh":
         falls = (strength < 0.0) & (8.0 * strength**2 >= 12.0 * mu * cohesion)
         if bool(falls.any()):
@@ -196,7 +214,11 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
         exponent = 1.0 - at("restitution") ** 2
     elif law == "von_mises":
         strength, hardening = at("yield_stress"), at("hardening_modulus")
-        damage = at("plastic_viscosity")
+        power, heat = at("hardening_exponent"), at("melting_heat")
+        cohesion = at("rate_sensitivity")
+        # a rate or heat of linear hardening is that of the exponent 1
+        exponent = torch.where((power == 0.0) & ((cohesion > 0.0) | (heat > 0.0)), 1.0, power)
+        damage = torch.where(exponent > 0.0, heat, at("plastic_viscosity"))
     elif law == "yeoh":
         strength, cohesion = at("yeoh_c20"), at("yeoh_c30")
     elif law == "ogden":

@@ -96,6 +96,13 @@ class Material:
         hardening_modulus: von_mises: growth of the yield stress per plastic strain [Pa]; below 0
             it falls, to zero at most.
         plastic_viscosity: von_mises: stress beyond yield per rate of flow [Pa s]; 0 flows at once.
+        hardening_exponent: von_mises: n of Johnson and Cook's ``yield_stress + hardening_modulus
+            strain^n``; 0 is linear hardening.
+        rate_sensitivity: von_mises: their C: a flow e times as fast takes so much more stress, as
+            a share of that at 1/s.
+        melting_heat: von_mises: heat that plastic work would have to give to melt it [J/m^3],
+            density times heat capacity times the way to the melting point over 0.9; the yield
+            stress falls as its heat grows. 0: it does not.
         cohesion_pressure: drucker_prager: tensile pressure [Pa] that the grains hold; 0 is dry.
         bulk_modulus: fluid: density times the square of its speed of sound [Pa].
         viscosity: fluid: dynamic viscosity [Pa s].
@@ -171,6 +178,9 @@ class Material:
     viscosity: Field | None = None
     tait_exponent: Field | None = None
     plastic_viscosity: Field | None = None
+    hardening_exponent: Field | None = None
+    rate_sensitivity: Field | None = None
+    melting_heat: Field | None = None
     yeoh_c20: Field | None = None
     yeoh_c30: Field | None = None
     ogden_alpha1: Field | None = None
@@ -268,6 +278,13 @@ class Material:
                 raise InputError(
                     f"material {self.name!r}: {field} does nothing under law {self.law!r}",
                     hint=f"remove it, or use law {' or '.join(readers)}",
+                )
+        thick = self.law == "von_mises" and bool((self._at("plastic_viscosity") > 0.0).any())
+        for field in laws.JOHNSON_COOK if thick else ():
+            if bool((self._at(field) > 0.0).any()):
+                raise InputError(
+                    f"material {self.name!r}: {field} and plastic_viscosity are two laws of rate",
+                    hint="keep one of them",
                 )
         if self.law in ("von_mises", "yeoh", "ogden"):
             wrong = laws.unstable(self.law, self.parameters())

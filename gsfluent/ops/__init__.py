@@ -26,6 +26,7 @@ __getattr__, __dir__, __all__ = lazy(
             "rollout",
         ),
         "gsfluent.ops.solver": ("Solver", "SolverError"),
+        "gsfluent.ops.average": ("kernel_average",),
         "gsfluent.ops.heat": ("conduct", "enthalpy", "lattice_links", "temperature"),
         "gsfluent.ops.deform": ("polar_clamped", "covariance_axes", "carry_axes", "carry_place"),
         "gsfluent.ops.mvee": ("mvee", "mvee_lens"),

@@ -120,7 +120,8 @@ def compiled_apart(law: Tensor, params: Tensor) -> Tensor:
         law: int32 [M].
         params: [M, 8].
     """
-    flows = (law == LAWS["von_mises"]) & ((params[:, 4] < 0) | (params[:, 5] > 0))
+    flows = (params[:, 4] < 0) | (params[:, 5] > 0) | (params[:, 7] > 0)
+    flows = (law == LAWS["von_mises"]) & flows
     return flows | (law == LAWS["yeoh"]) | (law == LAWS["ogden"])
 
 
@@ -130,7 +131,9 @@ def _check_apart(op: str, law: Tensor, params: Tensor) -> None:
         if not bool(rows.any()):
             continue
         if law.is_cuda:
-            what = "von_mises with plastic_viscosity or softening" if name == "von_mises" else name
+            what = name
+            if name == "von_mises":
+                what = "von_mises with plastic_viscosity, softening or hardening by a power"
             raise InputError(
                 f"{op}: law {what} has no CUDA kernel yet", hint="run on the CPU (device: cpu)"
             )
@@ -148,7 +151,8 @@ def _viscous(law: Tensor, params: Tensor) -> bool:
         if known is not None and known[0] == versions:
             return bool(known[1])
     flows = (law == LAWS["fluid"]) & (params[:, 2] > 0)
-    found = bool((flows | ((law == LAWS["von_mises"]) & (params[:, 5] > 0))).any())
+    thick = (law == LAWS["von_mises"]) & (params[:, 5] > 0) & (params[:, 7] == 0)
+    found = bool((flows | thick).any())
     if versions is not None:
         _viscous_tables[params] = (versions, found)
     return found
@@ -261,7 +265,8 @@ def return_mapping(
     * 2 ``drucker_prager``: Hencky elasticity, ``|dev tau| <= 3 alpha_DP (p + c)``, no tension
       beyond ``p = -c``, with volume correction.
     * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``; with a
-      plastic viscosity what is beyond flows back at a rate.
+      plastic viscosity what is beyond flows back at a rate; with an exponent n the surface is
+      ``sqrt(2/3) (sigma_y + H alpha^n) (1 + C ln rate) exp(-W / Q)`` (Johnson and Cook).
     * 4 ``fluid``: ``p = max(K/gamma (J^-gamma - 1), 0)`` and Newtonian viscosity; the strain is
       ``(J^(2/3) - 1) I`` and J follows ``det(I + A)``.
     * 9 ``phase_field``: neo-Hookean with psi+ degraded by the damage d of column 3,
@@ -284,7 +289,9 @@ def return_mapping(
             drucker_prager: alpha_DP, von_mises: yield stress sigma_y [Pa], fluid: viscosity
             [Pa s]); cohesion (nacc: beta, drucker_prager: tensile pressure c [Pa]); hardening
             (nacc: xi, von_mises: modulus H [Pa]); shear damage (nacc: eta, von_mises: plastic
-            viscosity [Pa s]); density [kg/m^3], not used here; exponent (fluid: gamma, 0 means 7).
+            viscosity [Pa s]); density [kg/m^3], not used here; exponent (fluid: gamma, 0 means 7;
+            von_mises: n of Johnson and Cook, whose rate factor C is then column 3 and whose heat Q
+            [J/m^3] is column 5).
             yeoh: C20 and C30 [Pa] in columns 2 and 3; ogden: alpha_1, mu_2 [Pa], alpha_2, mu_3
             [Pa] in columns 2 to 5, alpha_3 in column 7. phase_field: columns 2 to 5 are the
             threshold psi_t [J/m^3], the damage d, the length l [m], and split (0 volumetric, 1

@@ -357,7 +357,8 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
             f"quality: {shot.solve.quality}; hint: gsfluent chart SHOT.yaml --error "
             f"{shot.solve.error:.3g} chooses now"
         )
-    if not shot.events and not shot.colliders:
+    warm = any(settings.temperature is not None for settings in shot.objects.values())
+    if not shot.events and not shot.colliders and not warm:
         found.append(
             "the shot has no events: the object will only rest on the floor; hint: add an event"
         )

@@ -121,6 +121,7 @@ class Body:
         start: Time [s] at which the body passes ``offset`` with ``velocity``; before that it is
             on its way, in free flight.
         held: Instead of being on its way before ``start``, it waits at ``offset``.
+        temperature: At time 0 [degrees C]; None: heat plays no part for it.
     """
 
     name: str
@@ -136,6 +137,7 @@ class Body:
     axis: Vector = (0.0, 0.0, 1.0)
     start: float = 0.0
     held: bool = False
+    temperature: float | None = None
 
     @property
     def volume(self) -> float:

@@ -20,6 +20,7 @@ from gsfluent.errors import InputError
 from gsfluent.materials import Material
 from gsfluent.scene.colliders import MODES
 from gsfluent.scene.events import Events
+from gsfluent.scene.heat import Surroundings
 from gsfluent.scene.parts import Blade, Body, Collider, Part, known_key, number, vector
 
 __all__ = ["Blade", "Body", "Collider", "Part", "Scene"]
@@ -34,6 +35,8 @@ class Scene(Events):
         floor_friction: Coulomb friction of the floor.
         floor_mode: ``separate`` (matter may leave it), ``slip`` or ``sticky``.
         friction: Coulomb friction between bodies.
+        heat: What is around bodies that have a temperature; default: still air of 20 degrees C
+            and a floor that lets no heat through.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class Scene(Events):
         floor_friction: float = 0.4,
         floor_mode: str = "separate",
         friction: float = 0.3,
+        heat: Surroundings | None = None,
     ) -> None:
         self.floor = None if floor is None else number("floor", floor)
         self.gravity = vector("gravity", gravity)
@@ -51,6 +55,7 @@ class Scene(Events):
         self.friction = number("friction", friction, low=0.0)
         known_key("floor_mode", floor_mode, MODES)
         self.floor_mode = floor_mode
+        self.heat = heat
         super().__init__()
 
     @property
@@ -69,6 +74,7 @@ class Scene(Events):
         angular_velocity: Sequence[float] = (0.0, 0.0, 0.0),
         parts: Sequence[Part | Mapping[str, Any]] | None = None,
         name: str | None = None,
+        temperature: float | None = None,
     ) -> str:
         """Add a filled object where its frame puts it; events move it.
 
@@ -83,6 +89,8 @@ class Scene(Events):
                 labels and label images among their conditions must have been projected onto the
                 solid before (:class:`gsfluent.pipeline.Regions`).
             name: Name of the body; default ``object``, ``object2``, ...
+            temperature: At time 0 [degrees C]: heat flows in it, and it softens, melts and
+                freezes (docs/guide/heat.md). None: heat plays no part.
 
         Returns:
             The name of the body.
@@ -112,6 +120,9 @@ class Scene(Events):
             parts=regions,
             velocity=vector("velocity", velocity),
             angular_velocity=vector("angular_velocity", angular_velocity),
+            temperature=None
+            if temperature is None
+            else number("temperature", temperature, low=-273.15),
         )
         if placed is None and self.floor is not None:
             rise = self.floor - float(body.bounds()[0][2])

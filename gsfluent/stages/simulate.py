@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import time
@@ -24,6 +25,7 @@ from gsfluent.results.frames import SavedFrame, count_frames, packed_frame, writ
 from gsfluent.results.partition import FILE as PARTITION
 from gsfluent.results.partition import save_partition
 from gsfluent.results.store import content_digest
+from gsfluent.scene.heat import Surroundings
 from gsfluent.scene.scene import Body, Scene
 from gsfluent.stages.context import RunContext
 from gsfluent.stages.findings import (
@@ -60,10 +62,14 @@ def build_scene(shot: Shot, solids: dict[str, Solid], frame: Frame) -> Scene:
         gravity=shot.gravity,
         floor_mode=shot.floor_mode,
         floor_friction=shot.floor_friction,
+        heat=None if shot.heat is None else Surroundings(**dataclasses.asdict(shot.heat)),
     )
     for name, settings in shot.objects.items():
         parts = None if settings.parts is None else [part.to_dict() for part in settings.parts]
-        scene.add(solids[name], _material(settings), frame=frame, parts=parts, name=name)
+        scene.add(
+            solids[name], _material(settings), frame=frame, parts=parts, name=name,
+            temperature=settings.temperature,
+        )  # fmt: skip
     if shot.floor == "auto":
         _lift(scene)
     for collider in shot.colliders:
@@ -112,6 +118,7 @@ def moving_settings(shot: Shot) -> list[Any]:
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
         # as it was before there was a choice, where none is made
         [shot.solve.standing, *([shot.solve.contact] if shot.solve.contact != "nodes" else [])],
+        *([] if shot.heat is None else [dataclasses.asdict(shot.heat)]),
         shot.output.fps,
         shot.output.seconds,
     ]

@@ -21,7 +21,7 @@ from gsfluent.pipeline.cracks.gaps import Cracks
 from gsfluent.pipeline.cracks.stage import Repair
 from gsfluent.pipeline.matter.points import sample_points
 from gsfluent.pipeline.partition.tree import Partition
-from gsfluent.pipeline.render.camera import look_at
+from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.render.figures import cameras_around
 from gsfluent.pipeline.render.holes import Holes, MatterView
 from gsfluent.results.partition import SavedPartition
@@ -93,7 +93,7 @@ def _parts(rank: Tensor) -> bool:
 def _around(broken: Broken) -> list[Camera]:
     """Twelve cameras around the matter, as far off as those of a film."""
     positions = [broken.moment(k).position for k in (0, *broken.broken_frames())]
-    one = cameras_around(positions)[0]
+    one = cameras_around(Action.of(positions))[0]
     eye = one.viewmat[:3, :3].T @ -one.viewmat[:3, 3]
     # they look at the same place from the same distance
     forward = one.viewmat[2, :3]

@@ -16,6 +16,7 @@ from gsfluent import materials, ops
 from gsfluent.errors import InputError
 from gsfluent.lab.world.driver import World
 from gsfluent.materials import LAWS, READS, Material
+from gsfluent.materials.laws import JOHNSON_COOK
 from gsfluent.pipeline.matter.brittle import brittle_rows
 
 DX = 0.05
@@ -33,6 +34,10 @@ BASE: dict[str, Material] = {
     "von_mises": Material(
         "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3,
         plastic_viscosity=200.0, **SOLID,
+    ),
+    "von_mises by power": Material(
+        "test", law="von_mises", yield_stress=1500.0, hardening_modulus=5e3,
+        hardening_exponent=0.3, rate_sensitivity=0.05, melting_heat=5e3, **SOLID,
     ),
     "fluid": Material(
         "test", law="fluid", density=1000.0, bulk_modulus=1e5, viscosity=2.0, tait_exponent=7.0
@@ -119,6 +124,8 @@ def base_of(law: str, field: str) -> str:
         return "phase_field by strength" if field == "tensile_strength" else law
     if field in RELAXES:
         return f"{law} that relaxes"
+    if field in JOHNSON_COOK:
+        return "von_mises by power"
     if field == "yield_time":
         return "nacc that yields late"
     return "nacc by handbook" if field in materials.HANDBOOK else law

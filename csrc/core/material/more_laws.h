@@ -1,6 +1,7 @@
 // Laws that are compiled apart from those of laws.h, so that loops over the latter stay as they
-// are: Yeoh's and Ogden's rubber, and von Mises matter that flows with a viscosity or softens as
-// it flows. Definition: ops/reference/rubber.py and laws.py; equations: docs/theory/laws.md.
+// are: Yeoh's and Ogden's rubber, and von Mises matter that flows with a viscosity, softens as it
+// flows, or hardens by a power and by its rate. Definition: ops/reference/rubber.py and laws.py;
+// equations: docs/theory/laws.md.
 #pragma once
 
 #include "core/material/return_mapping.h"
@@ -11,11 +12,11 @@ namespace gsf {
 enum MoreLaw : int { kYeoh = 7, kOgden = 8 };
 
 // Whether laws.h does not know it. Columns of a row of von Mises: `damage` is the plastic viscosity
-// [Pa s], and `hardening` may be below zero.
+// [Pa s], and `hardening` may be below zero; with an `exponent` see power_von_mises.
 template <typename T>
 GSF_HOST_DEVICE bool compiled_apart(int law, const MaterialRow<T>& m) {
   return law == kYeoh || law == kOgden ||
-         (law == kVonMises && (m.damage > T(0) || m.hardening < T(0)));
+         (law == kVonMises && (m.damage > T(0) || m.hardening < T(0) || m.exponent > T(0)));
 }
 
 // --- Yeoh: W = C10 x + C20 x^2 + C30 x^3, x = J^(-2/3) tr b - 3, C10 = mu / 2 ---
@@ -97,6 +98,69 @@ GSF_HOST_DEVICE LawResult<T> viscous_von_mises(const MaterialRow<T>& m, const Sy
           true, h.guarded};
 }
 
+// --- von Mises with the hardening, rate and heating of Johnson and Cook ---
+// sigma_y = (A + B a^n) (1 + C ln(rate / 1 s^-1)) exp(-W / Q), the logarithm not below 0, W the
+// plastic work of the strain a at this rate: their 1 - T* with the exponent 1, where all heat stays
+// (d(1 - T*) / da = -sigma_y / Q). Columns: strength A [Pa], hardening B [Pa], exponent n, cohesion
+// C, damage Q [J/m^3], 0 without heating. Johnson and Cook 1983.
+
+template <typename T>
+GSF_HOST_DEVICE T power_yield(const MaterialRow<T>& m, T strain, T rate) {
+  using std::exp;
+  using std::log;
+  using std::pow;
+  const T grown = strain > T(0) ? m.hardening * pow(strain, m.exponent) : T(0);
+  const T faster = rate > T(1) ? T(1) + m.cohesion * log(rate) : T(1);
+  T yield = faster * (m.strength + grown);
+  if (m.damage > T(0))
+    yield *= exp(-faster * strain * (m.strength + grown / (T(1) + m.exponent)) / m.damage);
+  return yield;
+}
+
+// |s'| = |s| - 2 mu x = sqrt(2/3) sigma_y(a + sqrt(2/3) x) for the flow x between 0 and |s| / 2 mu,
+// by a bracket that false position (Illinois) or halving makes smaller. Without a step no rate is
+// known, and what hangs on one stays.
+template <typename T>
+GSF_HOST_DEVICE LawResult<T> power_von_mises(const MaterialRow<T>& m, const Sym3<T>& e, T alpha,
+                                             bool inverted, T dt) {
+  const T root = T(0.816496580927726);  // sqrt(2/3)
+  const HenckyState<T> h = hencky_state(e, inverted);
+  const T before = max(alpha, T(0));
+  const T limit = root * power_yield(m, before, T(0));
+  const T slack = sizeof(T) == 4 ? T(4e-6) : T(1e-14);
+  const T trial = T(2) * m.mu * h.n;
+  const bool flows = trial > limit + slack * (limit + T(0.25) * m.mu * max(h.log_j, -h.log_j)) &&
+                     (dt > T(0) || m.cohesion == T(0));
+  if (!flows) return {h.e, hencky_stress(m, h.dev, h.log_j), before, false, h.guarded};
+  const auto excess = [&](T x) {
+    const T rate = dt > T(0) ? root * x / dt : T(0);
+    return trial - T(2) * m.mu * x - root * power_yield(m, before + root * x, rate);
+  };
+  T low = T(0), high = h.n, below = trial - limit, above = excess(high);
+  const T fine = sizeof(T) == 4 ? T(2e-7) : T(4e-16);
+  int side = 0;
+  for (int i = 0; i < 100 && high - low > fine * high; ++i) {
+    T x = (low * above - high * below) / (above - below);
+    if (!(x > low && x < high) || i % 8 == 7) x = T(0.5) * (low + high);
+    const T f = excess(x);
+    if (f > T(0)) {
+      low = x;
+      below = f;
+      if (side == 1) above *= T(0.5);
+      side = 1;
+    } else {
+      high = x;
+      above = f;
+      if (side == -1) below *= T(0.5);
+      side = -1;
+      if (f == T(0)) break;
+    }
+  }
+  const Sym3<T> dev = max(T(1) - high / h.n, T(0)) * h.dev;
+  return {strain_from_hencky(dev, h.log_j), hencky_stress(m, dev, h.log_j), before + root * high,
+          true, h.guarded};
+}
+
 // return_mapping for every law there is.
 template <typename T>
 GSF_HOST_DEVICE ReturnMapped<T> return_mapping_more(const Sym3<T>& strain, T alpha,
@@ -107,9 +171,10 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping_more(const Sym3<T>& strain, T alp
   if (!compiled_apart(law, m) || !finite(e) || !finite(alpha))
     return return_mapping(strain, alpha, increment, law, m, o, dt);
   const bool inverted = !(det_identity_plus(increment) > T(0));
-  const LawResult<T> r = law == kYeoh    ? yeoh(m, e, alpha, inverted)
-                         : law == kOgden ? ogden(m, e, alpha, inverted)
-                                         : viscous_von_mises(m, e, alpha, inverted, dt);
+  const LawResult<T> r = law == kYeoh        ? yeoh(m, e, alpha, inverted)
+                         : law == kOgden     ? ogden(m, e, alpha, inverted)
+                         : m.exponent > T(0) ? power_von_mises(m, e, alpha, inverted, dt)
+                                             : viscous_von_mises(m, e, alpha, inverted, dt);
   return {r.strain, r.stress, r.alpha, r.plastic, r.guarded, inverted, false};
 }
 

@@ -221,7 +221,7 @@ GSF_HOST_DEVICE_COLD NaccState<T> nacc_plastic(const NaccMaterial<T>& m, const N
   out.alpha = clamp(alpha + step, T(kAlphaMin), T(kAlphaMax));
 #ifndef __CUDA_ARCH__
   // Without strength the surface is the same whatever alpha: solve_alpha would find this step too.
-  if (alpha >= T(0) && step >= T(0)) {
+  if (alpha >= T(0) && out.alpha >= T(0)) {
     out.d = ret.r * s.d;
     out.j2m1 = T(-2) * ret.p / m.kappa;
     return out;

@@ -37,6 +37,10 @@ struct ShadeArgs {
   T occlusion;          // strength, 0 to 1
   const T* studio;      // [kStudioColumns], or null
   T* out;               // [H, W, 3] display values in [0, 1]
+  // [maps, blocks + 1, blocks + 1] blocks of a map with an opaque texel before this line and column
+  // (cpu/shade.cpp), or null; CPU only
+  const int32_t* blockers = nullptr;
+  const T* pairs = nullptr;  // the maps as cpu/shade_taps.h reads them, or null; CPU only
 };
 
 }  // namespace gsf

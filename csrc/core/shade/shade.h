@@ -150,7 +150,7 @@ GSF_HOST_DEVICE Vec3<T> lamp_light(const T* lamp, const Vec3<T>& point, T* stren
   return (T(1) / distance) * away;
 }
 
-template <typename T>
+template <typename Taps, typename T>
 GSF_HOST_DEVICE Vec3<T> shade_surface(const ShadeArgs<T>& a, const Vec3<T>& point,
                                       const Vec3<T>& normal, const Vec3<T>& view,
                                       const Vec3<T>& albedo, T specular, T shininess) {
@@ -162,7 +162,7 @@ GSF_HOST_DEVICE Vec3<T> shade_surface(const ShadeArgs<T>& a, const Vec3<T>& poin
     const Vec3<T> toward = lamp_light(lamp, point, &strength);
     const T facing = dot(normal, toward);
     if (!(facing > T(0))) continue;
-    strength *= shadow_transmittance(a, lamp, point, normal, T(1));
+    strength *= shadow_transmittance<Taps>(a, lamp, point, normal, T(1));
     const T along = max(dot(normal, unit(toward + view)), T(0));
     const T highlight = strength * specular * pow(along, shininess);
     const T diffuse = strength * facing;
@@ -174,7 +174,7 @@ GSF_HOST_DEVICE Vec3<T> shade_surface(const ShadeArgs<T>& a, const Vec3<T>& poin
 }
 
 // Light on the floor, over pi; `bare`: without occlusion and shadows.
-template <typename T>
+template <typename Taps, typename T>
 GSF_HOST_DEVICE Vec3<T> floor_light(const ShadeArgs<T>& a, const Vec3<T>& point, bool bare) {
   const Vec3<T> up{T(0), T(0), T(1)};
   Vec3<T> sum = irradiance(a.environment, up);
@@ -184,14 +184,14 @@ GSF_HOST_DEVICE Vec3<T> floor_light(const ShadeArgs<T>& a, const Vec3<T>& point,
     T strength;
     const Vec3<T> toward = lamp_light(lamp, point, &strength);
     strength *= max(toward.z, T(0));
-    if (!bare && strength > T(0)) strength *= shadow_transmittance(a, lamp, point, up, T(0));
+    if (!bare && strength > T(0)) strength *= shadow_transmittance<Taps>(a, lamp, point, up, T(0));
     sum = sum + strength * Vec3<T>{lamp[4], lamp[5], lamp[6]};
   }
   return sum;
 }
 
 // Floor and backdrop along a unit ray.
-template <typename T>
+template <typename Taps, typename T>
 GSF_HOST_DEVICE Vec3<T> shade_studio(const ShadeArgs<T>& a, const Vec3<T>& eye,
                                      const Vec3<T>& ray) {
   using std::exp;
@@ -206,8 +206,8 @@ GSF_HOST_DEVICE Vec3<T> shade_studio(const ShadeArgs<T>& a, const Vec3<T>& eye,
   const T dx = (point.x - s[1]) / s[3], dy = (point.y - s[2]) / s[3];
   const T keep = exp(-(dx * dx + dy * dy));
   if (!(keep > T(kFaded))) return wall;
-  const Vec3<T> arrives = floor_light(a, point, false);
-  const Vec3<T> bare = floor_light(a, Vec3<T>{s[1], s[2], s[0]}, true);
+  const Vec3<T> arrives = floor_light<Taps>(a, point, false);
+  const Vec3<T> bare = floor_light<Taps>(a, Vec3<T>{s[1], s[2], s[0]}, true);
   const T open = max((bare.x + bare.y + bare.z) / T(3), T(1e-3));
   Vec3<T> mixed;
   for (int c = 0; c < 3; ++c)
@@ -215,7 +215,8 @@ GSF_HOST_DEVICE Vec3<T> shade_studio(const ShadeArgs<T>& a, const Vec3<T>& eye,
   return mixed;
 }
 
-template <typename T>
+// `Taps`: how shadow maps are looked at.
+template <typename Taps, typename T>
 GSF_HOST_DEVICE void shade_pixel(const ShadeArgs<T>& a, int64_t column, int64_t line) {
   const int64_t pixel = line * a.width + column;
   const T *m = a.viewmat, *k = a.intrinsics;
@@ -237,11 +238,11 @@ GSF_HOST_DEVICE void shade_pixel(const ShadeArgs<T>& a, int64_t column, int64_t 
     const T shininess = a.gloss ? a.gloss[1] : vectors[4] / thick;
     const Vec3<T> point = eye + a.depth[pixel] * forth;
     front = to_display(
-        shade_surface(a, point, normal, T(-1) * ray, to_linear(front), specular, shininess));
+        shade_surface<Taps>(a, point, normal, T(-1) * ray, to_linear(front), specular, shininess));
   }
   const T cover = alpha > T(kOpaque) ? T(1) : alpha;
   Vec3<T> behind{a.background[0], a.background[1], a.background[2]};
-  if (a.studio && cover < T(1)) behind = to_display(shade_studio(a, eye, ray));
+  if (a.studio && cover < T(1)) behind = to_display(shade_studio<Taps>(a, eye, ray));
   for (int c = 0; c < 3; ++c)
     a.out[3 * pixel + c] = clamp(front[c] * cover + behind[c] * (T(1) - cover), T(0), T(1));
 }

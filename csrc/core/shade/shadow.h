@@ -18,6 +18,7 @@ constexpr double kSteepest = 4.0;
 constexpr double kNormalOffset = 1.0;  // biases that a point is lifted off bumpy splats
 constexpr double kFade = 4.0;  // biases past the bias from which on a blocker counts in full
 constexpr double kTinyLength = 1e-12;
+constexpr int kBlockerEdge = 4;  // texels along a block of ShadeArgs::blockers
 
 // Points of Vogel's spiral over the unit disc, one after the other: turns by the golden angle.
 template <typename T>
@@ -71,6 +72,75 @@ struct ShadowView {
   }
 };
 
+GSF_HOST_DEVICE int blocker_blocks(int texels) {
+  return (texels + kBlockerEdge - 1) / kBlockerEdge;
+}
+
+// False when the map has nothing opaque within `reach` texels of a texel: one look instead of many.
+template <typename T>
+GSF_HOST_DEVICE bool may_block(const int32_t* blockers, int texels, T x, T y, T reach) {
+  const int last = texels - 1, pitch = blocker_blocks(texels) + 1;
+  const int left = index_within(x - reach, 0, last) / kBlockerEdge,
+            right = index_within(x + reach, 0, last) / kBlockerEdge + 1,
+            top = index_within(y - reach, 0, last) / kBlockerEdge * pitch,
+            bottom = (index_within(y + reach, 0, last) / kBlockerEdge + 1) * pitch;
+  return blockers[bottom + right] - blockers[bottom + left] - blockers[top + right] +
+             blockers[top + left] !=
+         0;
+}
+
+// The looks at a map, one after the other. cpu/shade_taps.h takes several at once.
+template <typename T>
+struct ShadowTaps {
+  const ShadowView<T>& view;
+
+  GSF_HOST_DEVICE ShadowTaps(const ShadeArgs<T>&, int, const ShadowView<T>& v) : view(v) {}
+
+  // Weight, weighted depth and depth of the deepest sure one of the blockers within `reach` texels.
+  GSF_HOST_DEVICE void search(T reach, T& weight, T& total, T& deepest) const {
+    Spiral<T> spiral;
+    for (int i = 0; i < kSearchTaps; ++i) {
+      T du, dv;
+      spiral.point(i, kSearchTaps, &du, &dv);
+      du *= reach;
+      dv *= reach;
+      const int64_t index = view.texel(view.x + du, view.y + dv);
+      const T found = view.depth_map[index], opacity = view.alpha_map[index];
+      if (!(opacity > T(0))) continue;
+      const T share = opacity * view.before(view.own_depth(du, dv), found);
+      if (share > T(0)) {
+        weight += share;
+        total += share * found;
+        if (share > T(kSure)) deepest = max(deepest, found);
+      }
+    }
+  }
+  // Blocking over a disc of `spread` texels, summed over its taps.
+  GSF_HOST_DEVICE T filter(T spread) const {
+    using std::floor;
+    T blocked = T(0);
+    Spiral<T> spiral;
+    for (int i = 0; i < kFilterTaps; ++i) {
+      T du, dv;
+      spiral.point(i, kFilterTaps, &du, &dv);
+      du *= spread;
+      dv *= spread;
+      const T own = view.own_depth(du, dv);
+      const T column = view.x + du - T(0.5), line = view.y + dv - T(0.5);
+      const T left = floor(column), top = floor(line), fx = column - left, fy = line - top;
+      for (int corner = 0; corner < 4; ++corner) {
+        const int dx = corner & 1, dy = corner >> 1;
+        const int64_t index = view.texel(left + T(dx), top + T(dy));
+        const T share = view.alpha_map[index];
+        if (share > T(0))
+          blocked += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * share *
+                     view.before(own, view.depth_map[index]);
+      }
+    }
+    return blocked;
+  }
+};
+
 // Which of a lamp's maps looks at a point: that in which it is deepest.
 template <typename T>
 GSF_HOST_DEVICE int shadow_face(const ShadeArgs<T>& a, const T* lamp, const Vec3<T>& p) {
@@ -90,10 +160,9 @@ GSF_HOST_DEVICE int shadow_face(const ShadeArgs<T>& a, const T* lamp, const Vec3
 }
 
 // Share of the lamp's light that reaches a point with unit normal; 1 behind the lamp.
-template <typename T>
+template <typename Taps, typename T>
 GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, const Vec3<T>& point,
                                        const Vec3<T>& normal, T biased) {
-  using std::floor;
   if (!a.map_depth || !(lamp[10] >= T(0))) return T(1);
   const int face = shadow_face(a, lamp, point);
   const T* row = a.map_cameras + kMapColumns * face;
@@ -128,23 +197,16 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   T search = lamp[9] * (view.depth - closest) * view.per_depth;
   if (is_point) search = search / max(closest, T(kTinyLength));
   search = clamp(search, T(kLeastSearch), most);
-  T weight = T(0), total = T(0), deepest = T(0);
-  Spiral<T> spiral;
-  for (int i = 0; i < kSearchTaps; ++i) {
-    T du, dv;
-    spiral.point(i, kSearchTaps, &du, &dv);
-    du *= search;
-    dv *= search;
-    const int64_t index = view.texel(view.x + du, view.y + dv);
-    const T found = view.depth_map[index], opacity = view.alpha_map[index];
-    if (!(opacity > T(0))) continue;
-    const T share = opacity * view.before(view.own_depth(du, dv), found);
-    if (share > T(0)) {
-      weight += share;
-      total += share * found;
-      if (share > T(kSure)) deepest = max(deepest, found);
-    }
+#ifndef __CUDA_ARCH__
+  if (a.blockers != nullptr) {
+    const int pitch = blocker_blocks(a.texels) + 1;
+    if (!may_block(a.blockers + int64_t(face) * pitch * pitch, a.texels, view.x, view.y, search))
+      return T(1);
   }
+#endif
+  const Taps taps(a, face, view);
+  T weight = T(0), total = T(0), deepest = T(0);
+  taps.search(search, weight, total, deepest);
   if (!(weight > T(0))) return T(1);
   // Of what a lamp sees of a body the rim, which limits the light, is deepest.
   const T mean = total / max(weight, T(kTinyLength));
@@ -152,26 +214,7 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   T spread = lamp[9] * max(view.depth - blocker, T(0)) * view.per_depth;
   if (is_point) spread = spread / max(blocker, T(kTinyLength));
   spread = clamp(spread, T(kLeastFilter), most);
-  T blocked = T(0);
-  spiral = Spiral<T>();
-  for (int i = 0; i < kFilterTaps; ++i) {
-    T du, dv;
-    spiral.point(i, kFilterTaps, &du, &dv);
-    du *= spread;
-    dv *= spread;
-    const T own = view.own_depth(du, dv);
-    const T column = view.x + du - T(0.5), line = view.y + dv - T(0.5);
-    const T left = floor(column), top = floor(line), fx = column - left, fy = line - top;
-    for (int corner = 0; corner < 4; ++corner) {
-      const int dx = corner & 1, dy = corner >> 1;
-      const int64_t index = view.texel(left + T(dx), top + T(dy));
-      const T share = view.alpha_map[index];
-      if (share > T(0))
-        blocked += (dx ? fx : T(1) - fx) * (dy ? fy : T(1) - fy) * share *
-                   view.before(own, view.depth_map[index]);
-    }
-  }
-  return T(1) - clamp(blocked / T(kFilterTaps), T(0), T(1));
+  return T(1) - clamp(taps.filter(spread) / T(kFilterTaps), T(0), T(1));
 }
 
 }  // namespace gsf

@@ -186,10 +186,14 @@ class HomePass {
         static_cast<uint8_t>(kTouchedSums | (contact != 0 ? kTouchedMoments : 0) |
                              (pushed ? kTouchedPush : 0) | (met ? kTouchedPoints : 0));
     return for_each_run(h, [&](int t, int64_t node, int run) {
-      std::atomic_ref<uint8_t>(touched[node / kBlockNodes])
-          .fetch_or(mark, std::memory_order_relaxed);
-      for (int n = 0; n < run; ++n)
-        for (int c = 0; c < 4; ++c) sums[4 * (node + n) + c] += tile[t + n][c];
+      std::atomic_ref<uint8_t> marks(touched[node / kBlockNodes]);  // mostly there already
+      if ((marks.load(std::memory_order_relaxed) & mark) != mark)
+        marks.fetch_or(mark, std::memory_order_relaxed);
+      for (int n = 0; n < run; ++n) {
+        double* sum = sums + 4 * (node + n);
+        const Quad<double> more = load_quad(sum) + tile[t + n];
+        std::memcpy(sum, &more, sizeof more);
+      }
       for (int n = 0; pushed && n < run; ++n)
         for (int c = 0; c < 4; ++c) surface_.sums()[4 * (node + n) + c] += push[t + n][c];
       for (int n = 0; met && n < run; ++n)
@@ -208,8 +212,7 @@ class HomePass {
     Lanes<T> tile[kWindowNodes];
     for_each_run(h, [&](int t, int64_t node, int run) {
       const T* in = s_.node_velocity + 4 * node;
-      for (int n = 0; n < run; ++n)
-        tile[t + n] = Lanes<T>{in[4 * n], in[4 * n + 1], in[4 * n + 2], T(0)};
+      for (int n = 0; n < run; ++n) tile[t + n] = load_quad(in + 4 * n);
     });
     const uint32_t reach = reach_of_row(s_.neighbour + kNeighbours * h);
     PacketLargest<T> largest;

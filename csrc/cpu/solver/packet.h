@@ -98,6 +98,17 @@ struct Packet {
     return {a[0], a[1], a[2], a[3], b[2], b[3]};
   }
 
+  // Columns of the rows of their materials.
+  [[gnu::always_inline]] void load_rows(const SolverView<T>& s, Pack<T>* out) const {
+    static_assert(kRowColumns == 12);
+    Quad<T> rows[kLanes];
+    for (int first = 0; first < kRowColumns; first += 4) {
+      for (int lane = 0; lane < kLanes; ++lane)
+        rows[lane] = load_quad(s.rows + int64_t(s.row_of(meta[lane])) * kRowColumns + first);
+      transpose(rows, out + first);
+    }
+  }
+
   // The same the other way, for the lanes in `lanes`.
   template <int kBytes>
   [[gnu::always_inline]] void store_rows(const Quad<T>* rows, T* array, int width, int first,
@@ -206,9 +217,7 @@ struct PacketMomentum {
       for (; lane < end; ++lane)
         add_plane(w, sum, one_lane(start[i][lane]), one_lane(y[lane]), one_lane(z[lane]),
                   [&](const Pack<T>& weights) { return Pack<T>(weights[lane]).v; });
-      for (int n = 0; n < 9; ++n)
-        node[n / 3 * kWindowEdge + n % 3] +=
-            __builtin_convertvector(both_lanes(sum[n]), Lanes<double>);
+      for (int n = 0; n < 9; ++n) node[n / 3 * kWindowEdge + n % 3] += doubles(both_lanes(sum[n]));
     }
   }
 
@@ -266,6 +275,13 @@ struct PacketMomentum {
       return __builtin_shufflevector(q, Quad<T>{}, 0, 1, 2, 3, 4, 5, 6, 7);
     else
       return q;
+  }
+  // gcc takes the conversion apart, through memory.
+  static Lanes<double> doubles(Lanes<T> x) {
+#ifdef __AVX__
+    if constexpr (sizeof(T) == 4) return __builtin_ia32_cvtps2pd256(x);
+#endif
+    return __builtin_convertvector(x, Lanes<double>);
   }
   static Lanes<T> both_lanes(Raw sum) {
     if constexpr (sizeof(T) == 4)

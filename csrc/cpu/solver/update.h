@@ -1,8 +1,9 @@
-// Update of a packet of particles as long as they are elastic. Whatever a lane's particle does
-// beyond that is left to finish_particle (core/solver/particle.h), which this file repeats without
-// branches; tests/ops/test_solver_cpu.py holds the two together.
+// Update of a packet of particles as long as they are elastic, or yield without strength. Whatever
+// a lane's particle does beyond that is left to finish_particle (core/solver/particle.h), which
+// this file repeats without branches; tests/ops/test_solver_cpu.py holds the two together.
 #pragma once
 
+#include "core/material/nacc_softened.h"
 #include "cpu/solver/packet.h"
 
 namespace gsf::cpu {
@@ -78,21 +79,27 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   if (packet.same_rows()) {
     for (int i = 0; i < kRowColumns; ++i) row[i] = P(s.rows[row_of(0) * kRowColumns + i]);
   } else {
-    for (int i = 0; i < kRowColumns; ++i)
-      row[i] = pack_of<T>([&](int lane) { return s.rows[row_of(lane) * kRowColumns + i]; });
+    packet.load_rows(s, row);
   }
 
   Mat3<P> increment;
   for (int i = 0; i < 9; ++i) increment.m[i] = P(dt) * c.m[i];
-  const Sym3<P> e = update_strain(packet.load6(s.strain), increment);
-  const P j2m1 = det_minus_one(e);
-  const P isochoric = reciprocal_cube_root(P(1) + j2m1);
-  const Sym3<P> d = isochoric * deviator(e);
-  const P n2 = norm2(d);
+  Sym3<P> e = update_strain(packet.load6(s.strain), increment);
+  P j2m1 = det_minus_one(e);
+  P isochoric = reciprocal_cube_root(P(1) + j2m1);
+  Sym3<P> d = isochoric * deviator(e);
+  P n2 = norm2(d);
   plain &= (max_abs(e) <= P(kStrainMax)) & (j2m1 >= P(kJMin * kJMin - 1.0)) &
            (j2m1 <= P(kJMax * kJMax - 1.0)) & (n2 <= P(kDeviatorMax * kDeviatorMax)) &
            (det_identity_plus(increment) > P(0));
+  const auto mix = [](Int mask, Sym3<P>& to, const Sym3<P>& from) {
+    to = {select<T>(mask, from.xx, to.xx), select<T>(mask, from.yy, to.yy),
+          select<T>(mask, from.zz, to.zz), select<T>(mask, from.xy, to.xy),
+          select<T>(mask, from.xz, to.xz), select<T>(mask, from.yz, to.yz)};
+  };
   Int whole = Int{} - 1;  // not broken
+  Int softens{};          // yields without strength
+  [[maybe_unused]] P alpha_after(0), peak_after(0);
   P loss(0);
   Int phase{};
   P damage(0), history(0), all(0);
@@ -127,8 +134,30 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const P alpha = packet.load1(s.alpha), peak = packet.load1(s.peak);
       P cohesion = row[3];
       if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
-      plain &= ~nacc | (surely_elastic(row, cohesion, alpha, j2m1, n2) & (alpha <= peak));
+      const Int holds = surely_elastic(row, cohesion, alpha, j2m1, n2);
       whole &= ~nacc | (peak < P(0));
+      if constexpr (kLaws != kViscousBrittle) {
+        softens = plain & nacc & ~holds & (alpha >= P(0)) & (alpha <= P(kAlphaMax)) &
+                  (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin));
+        if (s.options.k == T(2) && mask_bits(softens) != 0) {
+          const NaccMaterial<P> m{row[0], row[1], row[2], cohesion, row[4], row[5]};
+          const Softened<P> now = softened_return(m, P(s.options.epsilon), d, sqrt(n2), j2m1);
+          const P slack(sizeof(T) == 4 ? 1e-6 : 2e-15);
+          softens &= (now.outside > slack) & (alpha + now.step >= P(0)) &
+                     (now.n2 <= P(kSoftenedShear * kSoftenedShear));
+          mix(softens, e, now.strain);
+          mix(softens, d, now.d);
+          j2m1 = select<T>(softens, now.j2m1, j2m1);
+          isochoric = select<T>(softens, now.isochoric, isochoric);
+          n2 = select<T>(softens, now.n2, n2);
+          alpha_after = min(alpha + now.step, P(kAlphaMax));
+          peak_after = max(peak, alpha_after);
+          whole &= ~softens;
+        } else {
+          softens = Int{};
+        }
+      }
+      plain &= ~nacc | softens | (holds & (alpha <= peak));
       loss = select<T>(nacc, row[7], loss);
     }
   }
@@ -138,13 +167,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     if (mask_bits(phase) != 0) {
       const PhaseState<P> now = phase_state(row[0], row[1], damage, all, d, unit_det_shift_small(d),
                                             j2m1, [](P x) { return volume_series(x); });
-      const auto mix = [&](P& to, P from) { to = select<T>(phase, from, to); };
-      mix(stress.xx, now.stress.xx);
-      mix(stress.yy, now.stress.yy);
-      mix(stress.zz, now.stress.zz);
-      mix(stress.xy, now.stress.xy);
-      mix(stress.xz, now.stress.xz);
-      mix(stress.yz, now.stress.yz);
+      mix(phase, stress, now.stress);
       history = max(history, min(now.active / row[2], P(kDriveMax)) - P(1));
     }
   }
@@ -206,6 +229,15 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     for (uint32_t left = done; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
+    }
+    if constexpr (kLaws != kElasticOnly && kLaws != kViscousBrittle) {
+      const uint32_t yielding = done & mask_bits(softens);
+      counts.plastic += __builtin_popcount(yielding);
+      for (uint32_t left = yielding; left != 0; left &= left - 1) {
+        const int lane = __builtin_ctz(left);
+        s.alpha[packet.index[lane]] = alpha_after[lane];
+        s.peak[packet.index[lane]] = peak_after[lane];
+      }
     }
     if constexpr (kLaws == kDamageField)
       for (uint32_t left = done & mask_bits(phase); left != 0; left &= left - 1) {

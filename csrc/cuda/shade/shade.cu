@@ -12,7 +12,7 @@ template <typename T>
 __global__ void __launch_bounds__(kColumns* kLines) shade_kernel(ShadeArgs<T> a) {
   const int64_t column = int64_t(blockIdx.x) * kColumns + threadIdx.x;
   const int64_t line = int64_t(blockIdx.y) * kLines + threadIdx.y;
-  if (column < a.width && line < a.height) shade_pixel(a, column, line);
+  if (column < a.width && line < a.height) shade_pixel<ShadowTaps<T>>(a, column, line);
 }
 
 }  // namespace

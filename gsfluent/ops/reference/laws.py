@@ -70,6 +70,16 @@ def von_mises(
     is eta times the strain rate, over mu tr(b) / (3 mu) as PAC-NeRF has it. Softening (a negative
     modulus) ends with the yield stress at zero.
     """
+    by_power = m.exponent > 0
+    if bool(by_power.any()):
+        rows = [by_power.nonzero()[:, 0], (~by_power).nonzero()[:, 0]]
+        of = (_power_von_mises, von_mises)
+        parts = [
+            law(e[r], log_j[r], guarded[r], alpha[r], Material(*(c[r] for c in m)), dt)
+            for law, r in zip(of, rows, strict=True)
+        ]
+        back = torch.argsort(torch.cat(rows))
+        return Returned(*(torch.cat(both)[back] for both in zip(*parts, strict=True)))
     dev = deviator(spectral(e, "log"))
     n = safe_norm(dev)
     before = alpha.clamp(min=0.0)
@@ -85,6 +95,73 @@ def von_mises(
     slip = (trial - limit) / (2.0 * m.mu + 2.0 / 3.0 * m.hardening + drag)
     spent = (m.hardening < 0) & (m.friction + m.hardening * (before + _ROOT * slip) < 0)
     slip = torch.where(spent, trial / (2.0 * m.mu + drag), slip)
+    slip = torch.where(plastic, slip, 0.0)
+    factor = (1.0 - slip / torch.where(plastic, n, 1.0)).clamp(min=0.0)
+    strain, dev, log_j = _mix(e, dev, log_j, factor[:, None] * dev, log_j, plastic)
+    return Returned(strain, before + _ROOT * slip, _stress(m, dev, log_j), plastic, guarded)
+
+
+def power_yield(m: Material, strain: Tensor, rate: Tensor) -> Tensor:
+    """Yield stress of Johnson and Cook [Pa] of plastic strains and rates [1/s], [N].
+
+    ``(A + B a^n) (1 + C ln rate) exp(-W / Q)`` with the plastic work W of the strain at this rate:
+    heat that stays, with the exponent of the temperature at 1.
+    """
+    some = torch.where(strain > 0, strain, 1.0)
+    grown = torch.where(strain > 0, m.hardening * some**m.exponent, 0.0)
+    faster = 1.0 + m.cohesion * torch.log(rate.clamp(min=1.0))
+    hot = m.shear_damage > 0
+    heat = torch.where(hot, m.shear_damage, 1.0)
+    work = faster * strain * (m.friction + grown / (1.0 + m.exponent))
+    return faster * (m.friction + grown) * torch.where(hot, torch.exp(-work / heat), 1.0)
+
+
+def _power_slope(m: Material, strain: Tensor, slip: Tensor, dt: float) -> Tensor:
+    """Growth of :func:`power_yield` with the strain of a step of length ``dt`` [Pa], [N]."""
+    some = strain.clamp(min=1e-300)
+    rate = (_ROOT * slip / dt if dt > 0.0 else torch.zeros_like(slip)).clamp(min=1.0)
+    faster, bare = 1.0 + m.cohesion * torch.log(rate), m.friction + m.hardening * some**m.exponent
+    cold = torch.where(m.shear_damage > 0, m.shear_damage, torch.inf)
+    work = some * (m.friction + m.hardening * some**m.exponent / (1.0 + m.exponent)) * faster / cold
+    along = m.hardening * m.exponent * some ** (m.exponent - 1.0) - faster * bare**2 / cold
+    slope = faster * along
+    if dt > 0.0:
+        slope = slope + torch.where(rate > 1.0, m.cohesion / (rate * dt), 0.0) * bare * (1.0 - work)
+    return torch.exp(-work) * slope
+
+
+def _power_von_mises(
+    e: Tensor, log_j: Tensor, guarded: Tensor, alpha: Tensor, m: Material, dt: float
+) -> Returned:
+    """Radial return to the surface of :func:`power_yield`, which moves with the flow.
+
+    The flow is found by halving; one step of Newton's method then carries its derivative.
+    """
+    dev = deviator(spectral(e, "log"))
+    n = safe_norm(dev)
+    before = alpha.clamp(min=0.0)
+    limit = _ROOT * power_yield(m, before, torch.zeros_like(n))
+    trial = 2.0 * m.mu * n
+    plastic = trial > limit + _slack(e) * (limit + 0.25 * m.mu * log_j.abs())
+    if dt == 0.0:
+        plastic = plastic & (m.cohesion == 0)
+
+    def excess(x: Tensor) -> Tensor:
+        rate = _ROOT * x / dt if dt > 0.0 else torch.zeros_like(x)
+        return trial - 2.0 * m.mu * x - _ROOT * power_yield(m, before + _ROOT * x, rate)
+
+    with torch.no_grad():
+        low, high = torch.zeros_like(n), n.clone()
+        for _ in range(120):
+            middle = 0.5 * (low + high)
+            more = excess(middle) > 0
+            low, high = torch.where(more, middle, low), torch.where(more, high, middle)
+    slip = high
+    if torch.is_grad_enabled():
+        off = excess(high)
+        with torch.no_grad():
+            falls = -2.0 * m.mu - 2.0 / 3.0 * _power_slope(m, before + _ROOT * high, high, dt)
+        slip = high - (off - off.detach()) / falls
     slip = torch.where(plastic, slip, 0.0)
     factor = (1.0 - slip / torch.where(plastic, n, 1.0)).clamp(min=0.0)
     strain, dev, log_j = _mix(e, dev, log_j, factor[:, None] * dev, log_j, plastic)

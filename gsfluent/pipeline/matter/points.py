@@ -49,6 +49,8 @@ class Matter:
         ranges: First and last + 1 row of each body's points.
         spacing: Mean distance between neighbouring points of each body [m].
         dx: Grid spacing [m].
+        ladder: First row of the steps from solid to liquid of each point, int32 [N]; -1 where
+            there are none, None where nothing has a temperature.
     """
 
     particles: Particles
@@ -57,15 +59,19 @@ class Matter:
     ranges: tuple[tuple[int, int], ...]
     spacing: tuple[float, ...]
     dx: float
+    ladder: Tensor | None = None
 
     @property
     def rest(self) -> Tensor:
         """Positions at time 0 [m], [N, 3]."""
         return self.particles.position
 
-    def of_law(self, *names: str) -> Tensor:
-        """Points whose material obeys one of these laws (:data:`gsfluent.materials.LAWS`), [N]."""
-        law = self.law[self.particles.material.long()]
+    def of_law(self, *names: str, points: Particles | None = None) -> Tensor:
+        """Points whose material obeys one of these laws (:data:`gsfluent.materials.LAWS`), [N].
+
+        As they start, or as ``points`` are now: what melts is a liquid then.
+        """
+        law = self.law[(points or self.particles).material.long()]
         wanted = torch.tensor([materials.LAWS[name] for name in names], device=law.device)
         return torch.isin(law, wanted.to(law.dtype))
 

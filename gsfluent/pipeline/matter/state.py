@@ -74,6 +74,9 @@ class State(NamedTuple):
             :func:`gsfluent.pipeline.matter.fragments.rest_links`.
         given: Impulse [N s] and torque about its point [N m s] that each grip gave, [G, 6].
         pushed: How many of the scene's impulses have been given.
+        enthalpy: Heat of each point [J/kg], float64 [N] (:func:`gsfluent.ops.temperature`); None
+            where nothing has a temperature.
+        level: Its step from solid (0) to liquid, int8 [N]; None likewise.
     """
 
     particles: Particles
@@ -100,6 +103,8 @@ class State(NamedTuple):
     cut_links: Tensor
     given: Tensor
     pushed: int = 0
+    enthalpy: Tensor | None = None
+    level: Tensor | None = None
 
     @staticmethod
     def start(
@@ -169,6 +174,7 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         },
         # a state without grips is that of versions before
         **({"given": state.given.cpu()} if state.given.numel() else {}),
+        **{name: value.cpu() for name, value in _heat(state).items()},
         "time": state.time,
         "step": state.step,
         "landed": list(state.landed),
@@ -176,6 +182,13 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "extra": extra,
     }
     write_tensors(path, values)
+
+
+def _heat(state: State) -> dict[str, Tensor]:
+    """What a state has of heat, by the names of the fields; nothing where there is none."""
+    if state.enthalpy is None or state.level is None:
+        return {}
+    return {"enthalpy": state.enthalpy, "level": state.level}
 
 
 def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]:
@@ -212,6 +225,8 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
         landed=tuple(bool(v) for v in values["landed"]),
         pushed=int(values["kicked"]),
         given=values.get("given", rounded.new_zeros(0, 6, dtype=torch.float64)),
+        enthalpy=values.get("enthalpy"),
+        level=values.get("level"),
         **tensors,
     )
     return state, values["extra"]

@@ -116,7 +116,7 @@ def weld(matter: Matter, web: Web, state: State, pieces: Pieces) -> State:
     wanted, held = strong[rows], strain[rows]
     after, kept, _, _ = ops.return_mapping(
         held, wanted, strain.new_zeros(rows.shape[0], 3, 3), law=matter.law,
-        params=matter.params.to(strain), material=matter.particles.material[rows], dt=1.0,
+        params=matter.params.to(strain), material=state.particles.material[rows], dt=1.0,
     )  # fmt: skip
     fits = (after == held).all(dim=1) & (kept == wanted) & (alpha[rows] >= wanted)
     at = at.index_put((rows,), fits)

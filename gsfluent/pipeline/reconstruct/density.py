@@ -162,7 +162,8 @@ def clamp_aspect(model: SplatModel) -> None:
     if model.isotropic:
         return
     scales = model.parameters["scales"].detach()
-    middle = scales.sort(dim=1).values[:, 1]
+    a, b, c = scales.unbind(1)
+    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c))
     scales.copy_(torch.minimum(scales, (middle + math.log(_ASPECT))[:, None]))
 
 

@@ -107,7 +107,7 @@ def attributed(model: SplatModel, views: list[TrainView], degree: int) -> tuple[
         probe = torch.zeros(model.count, 1, device=model.device, requires_grad=True)
         blended = model.render(view, 0, features=probe, contribution=True)
         assert blended.contribution is not None
-        (slope,) = torch.autograd.grad(blended.image, probe, wrong[..., None])
+        (slope,) = torch.autograd.grad((blended.image * wrong[..., None]).sum(), probe)
         error += slope[:, 0]
         weight += blended.contribution.detach()
     return error, weight

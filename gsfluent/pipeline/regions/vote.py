@@ -116,7 +116,8 @@ def label_votes(gaussians: Gaussians, view: LabelView, labels: NDArray[np.int64]
         )
         with torch.enable_grad():
             drawn = draw(gaussians, view.camera, colors=colors, deterministic=True).image
-        (votes,) = torch.autograd.grad(drawn, colors, shown)
+            counted = (drawn * shown).sum()
+        (votes,) = torch.autograd.grad(counted, colors)
         found.append(votes.detach())
     return torch.cat(found, dim=1) if found else torch.zeros(gaussians.count, 0, device=device)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Capture, Frame
 from gsfluent.errors import InputError
+from gsfluent.geometry import quantiles
 from gsfluent.io.checked.files import read_json
 from gsfluent.pipeline.render.path import dolly, holds_poses, through, turntable
 
@@ -63,16 +64,15 @@ class Action:
                 [N]; all of it when absent.
         """
         # the middle of what lies between the outer tenths: a median follows the largest heap only
-        tenths = torch.tensor([0.1, 0.9], dtype=torch.float64)
         centers, radius, extent = [], [], []
         for matter in positions:
             points = _thin(matter.double().cpu())
-            center = torch.quantile(points, tenths, dim=0).mean(dim=0)
+            center = quantiles(points, (0.1, 0.9)).mean(dim=0)
             away = points - center
             centers.append(center)
-            radius.append(torch.quantile(away.norm(dim=-1), 0.9))
+            radius.append(quantiles(away.norm(dim=-1), (0.9,))[0])
             apart = torch.stack([away[:, :2].norm(dim=-1), away[:, 2].abs()], dim=-1)
-            extent.append(torch.quantile(apart, _SHARE, dim=0))
+            extent.append(quantiles(apart, (_SHARE,))[0])
         center = torch.stack(centers)
         first = positions[0].double().cpu()
         first = first if objects is None else first[objects.cpu()]

@@ -210,11 +210,10 @@ def _holes(drawn: Rendered, matter: MatterView) -> Holes:
     return Holes.of(drawn.alpha, drawn.depth, matter)
 
 
-def cameras_around(positions: list[Tensor]) -> list[Camera]:
+def cameras_around(action: Action) -> list[Camera]:
     """Cameras that stand still and see nine tenths of the matter of all frames."""
-    action = Action.of(positions)
     first = float(action.radius[0])
-    center = action.center[len(positions) // 2 :].mean(0)
+    center = action.center[len(action.center) // 2 :].mean(0)
     away = (action.center - center).norm(dim=1) + action.radius
     reach = min(float(away.amax()), 2.5 * first)
     distance = reach / math.sin(math.radians(_FIELD / 2))

@@ -75,7 +75,7 @@ class Film:
             capture=load_capture(shot.capture) if needs_capture and shot.capture else None,
             frame=read_frame(isolated) if (isolated / "frame.json").is_file() else None,
         )
-        self.around = cameras_around(positions)
+        self.around = cameras_around(action)
         self.backdrop: Backdrop | None = None
         if shot.output.backdrop == "captured":
             self.backdrop = captured_backdrop(out / "stages", list(shot.objects), device)

@@ -47,6 +47,7 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
         InputError: A new body is a solid (its splats could not follow).
     """
     old, state = run.scene, run.state
+    _without_heat(run)
     fresh = scene.bodies[len(old.bodies) :]
     for body in fresh:
         if body.solid is not None:
@@ -100,6 +101,7 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
         raise ValueError(f"shrink: bodies {wrong} cannot leave")
     if not gone:
         return
+    _without_heat(run)
     matter, state = run.matter, run.state
     device = matter.particles.device
     out = torch.isin(matter.particles.body, torch.tensor(list(gone), device=device).int())
@@ -164,6 +166,19 @@ def shrink(run: Run, gone: Sequence[int], *, solids: int) -> None:
     run.links = place[run.links[~out[run.links].any(dim=1)]]
     run.stepper.flights = [run.stepper.flights[n] for n in stay]
     _refit(run, scene, matter, state)
+
+
+def _without_heat(run: Run) -> None:
+    """Refuse a run whose points have temperatures.
+
+    Raises:
+        InputError: They have.
+    """
+    if run.matter.ladder is not None:
+        raise InputError(
+            "live: nothing can be added to or taken from a scene that has temperatures",
+            hint="start a session with it in the scene, or leave out the temperatures",
+        )
 
 
 def _refit(run: Run, scene: Scene, matter: Matter, state: State) -> None:

@@ -205,7 +205,7 @@ class Watch:
             waits: Which bodies wait to be fired or poured yet.
             floor: Height of the floor [m]; None without one.
         """
-        flows = self.matter.of_law("fluid", "drucker_prager", "rigid")
+        flows = self.matter.of_law("fluid", "drucker_prager", "rigid", points=state.particles)
         ratio = _volume_ratio(state)
         for number, (a, b) in enumerate(self.matter.ranges):
             kept = a + (~state.loose[a:b]).nonzero()[:, 0]

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.pipeline.colliders.grips import strongest
+from gsfluent.pipeline.heat.looks import Heat
 from gsfluent.pipeline.liquid.nozzle import pours
 from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
@@ -63,7 +64,7 @@ class Run:
         links = rest_links(matter.rest, matter.ranges, matter.spacing).to(device)
         # each end's rows one after the other: every look gathers by them
         self.links = links.t().contiguous().t()
-        self.state = self.stepper.initial(self.links.shape[0])
+        self.state = self.heat.begun(self.stepper.initial(self.links.shape[0]))
         self.figures = figures_of(matter, self.state, scene.gravity)
         self.start = self.figures
         self.watch = Watch(
@@ -83,6 +84,7 @@ class Run:
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
         self.impulses = Impulses(scene, matter)
+        self.heat = Heat(scene, matter, deterministic=self.stepper.options.deterministic)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
@@ -143,9 +145,11 @@ class Run:
                 state = self.impulses.given(state)
                 stop = min(until, self.impulses.next_change(state))
                 stop = min(stop, stepper.liquids.next_look(state.time))
+                stop = min(stop, self.heat.next_look(state.time))
                 now = stepper.advance(state, stop, 1 if hook is not None else left)
                 state = now if hook is None else hook(now).adopting(now)
                 state = stepper.liquids.look(state, grid_mask(state, self.matter))
+                state = self.heat.look(state)
                 if state.time >= until or state.step - checked >= CHECK_EVERY:
                     state = bounded(state)
                     trouble = watch.check(state, stepper)
@@ -251,6 +255,8 @@ class Run:
                 state.colliders, state.given - given, state.time - since
             )
             self._gripped = state.time, state.given
+        if heat := self.heat.figures(state):
+            stats["heat"] = heat
         self.per_frame.append(stats)
         return now, pieces, stats
 
@@ -298,7 +304,7 @@ class Run:
                 f"resume: {path} was made at {extra['fps']} frames per second, not {self.fps}",
                 hint="use the same fps, or start without resume",
             )
-        self.state = state
+        self.state = self.heat.taken_up(state)
         self._gripped = state.time, state.given
         self.stepper.resume(Counters(**extra["counters"]))
         self.stepper.field_limit = int(extra["field_limit"])

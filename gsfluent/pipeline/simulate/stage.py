@@ -24,6 +24,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.cracks.gaps import Cracks
 from gsfluent.pipeline.cracks.stage import METHODS, CrackHistory, Repair, Repaired
+from gsfluent.pipeline.heat.ladder import thawing
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.matter.fragments import Fragments
 from gsfluent.pipeline.matter.points import (
@@ -305,6 +306,7 @@ class Simulate(Stage):
             device=scene.device if self.device is None else self.device,
             max_particles=self.max_particles,
         )
+        matter = thawing(scene, matter)
         if not self.splats:
             particles = matter.particles.replace(deformation=None)
             matter = dataclasses.replace(matter, particles=particles)

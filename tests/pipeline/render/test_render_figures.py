@@ -11,6 +11,7 @@ import torch
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
+from gsfluent.pipeline.render.camera import Action
 from gsfluent.pipeline.render.figures import FilmFigures, RawCarry, cameras_around
 from gsfluent.pipeline.render.flicker import Flow, flicker
 from gsfluent.pipeline.render.holes import REACH, RIM, Holes, MatterView
@@ -228,7 +229,7 @@ def test_the_figures_of_a_film_put_what_is_drawn_beside_what_is_not_repaired() -
     points = slab(layers=1)
     splats = fine(points, opacity=0.5)
     figures = FilmFigures(
-        saved(points, splats, 0, splats.count), cameras_around([points])[:1], every=4
+        saved(points, splats, 0, splats.count), cameras_around(Action.of([points]))[:1], every=4
     )
 
     def add(points: torch.Tensor, splats: Gaussians, carried: int) -> None:

@@ -6,13 +6,15 @@ import csv
 import math
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
-from gsfluent.lab.world.shapes import sheet
+from gsfluent.lab.world.shapes import box, sheet
 from gsfluent.lab.world.walls import between_planes, wall
 
 FLUID = 4
@@ -158,4 +160,103 @@ def liquid_at_rest() -> list[Result]:
         ),
         compare("pressure over rho g H, two cells up", inside, tolerance=0.05, source=source),
         compare("pressure over rho g H at the floor", beside, tolerance=0.1, source=source),
+    ]  # fmt: skip
+
+
+class Column(NamedTuple):
+    """Pressure in a column of water at rest, off hydrostatics; all over rho g H."""
+
+    own: float  # scatter of the points' own in the lowest cell
+    noise: float  # scatter of the average in the lowest cell
+    fixed: float  # the same, averaged over 1/8 m
+    inside: float  # scatter of the average over the rest below the surface
+    off: float  # mean of the average in the lowest cell
+    slope: float  # of the average over depth, less 1
+
+
+def water_column(cells: int, seed: int = 0) -> Column:
+    """A column 1 m high and four cells wide, of points off their lattice, after 0.6 s.
+
+    Means over ten states, without damping. The average is that of :func:`ops.kernel_average` over
+    two cells, where nothing else is said.
+
+    Args:
+        cells: Height in cells.
+        seed: Of the places of the points.
+    """
+    dx = 1.0 / cells
+    generator = torch.Generator().manual_seed(seed)
+    points = box([0.0, 0.0, 0.0], [4.0 * dx, 1.0, 4.0 * dx], 0.5 * dx)
+    shift = torch.rand(points.shape, generator=generator, dtype=torch.float64) - 0.5
+    points = points + 0.25 * dx * shift
+    row = water(10.0 * math.sqrt(GRAVITY))
+    world = World(
+        points, [0.0, 0.0, 0.0], volume=0.125 * dx**3, dx=dx, law=FLUID, params=row,
+        colliders=[*between_planes(dx, axes=(0, 2), width=4.0 * dx), wall(1)],
+        gravity=(0.0, -GRAVITY, 0.0), dtype=torch.float32,
+        strain=hydrostatic(1.0 - points[:, 1], row),
+    )  # fmt: skip
+    world.run(seconds=0.6)
+    scale = float(row[6]) * GRAVITY
+    found = []
+    for _ in range(10):
+        world.run(steps=37)
+        place = world.position.double()
+        depth = 1.0 - place[:, 1]
+        own = -world.stress[:, :3].double().mean(dim=1) / scale
+        mean, fixed = (
+            ops.kernel_average(own, position=place, mass=world.scene.mass.double(), length=length)
+            for length in (2.0 * dx, 0.125)
+        )
+        lowest = depth > 1.0 - dx
+        rest = (depth < 1.0 - 2.0 * dx) & (depth > 0.1)
+        off = mean - depth
+        lever = depth[rest] - depth[rest].mean()
+        found.append(
+            torch.stack([
+                (own - depth)[lowest].std(), off[lowest].std(),
+                (fixed - depth)[lowest].std(), off[rest].std(), off[lowest].mean(), 
+                (lever * off[rest]).sum() / (lever**2).sum(),
+            ])
+        )  # fmt: skip
+    return Column(*torch.stack(found).mean(dim=0).tolist())
+
+
+@problem(tier="fast")
+def hydrostatic_column() -> list[Result]:
+    """Column of water at rest: scatter and slope of its pressure, as points and as an average."""
+    coarse, middle, fine = (
+        Column(*torch.tensor([water_column(cells, seed) for seed in range(3)]).mean(0).tolist())
+        for cells in (8, 16, 32)
+    )
+    each = "8, 16, 32 cells: {:.4f}, {:.4f}, {:.4f}"
+    own = each.format(coarse.own, middle.own, fine.own)
+    noise = each.format(coarse.noise, middle.noise, fine.noise)
+    inside = each.format(coarse.inside, middle.inside, fine.inside)
+    source = "hydrostatics"
+    return [
+        compare(
+            "noise of the averaged pressure at the floor, 16 cells", middle.noise, tolerance=0.02,
+            source=source, note=noise,
+        ),
+        compare(
+            "the same averaged over 1/8 m, 32 cells over 16", fine.fixed / middle.fixed,
+            tolerance=0.5, source="falls with dx", note=each.format(
+                coarse.fixed, middle.fixed, fine.fixed),
+        ),
+        compare(
+            "noise of the averaged pressure above, 16 cells", middle.inside, tolerance=0.02,
+            source=source, note=inside,
+        ),
+        compare("slope over depth, 16 cells", 1.0 + middle.slope, 1.0, tolerance=0.02,
+                source=source),
+        compare(
+            "mean pressure of the lowest cell, too much, 16 cells", middle.off, tolerance=0.05,
+            source=source, note=each.format(coarse.off, middle.off, fine.off)
+            + "; the floor's nodes have points on one side only",
+        ),
+        compare(
+            "noise of the points' own pressure at the floor, 16 cells", middle.own, tolerance=0.02,
+            source=source, note=own + "; quadrature (docs/theory/liquids.md)",
+        ),
     ]  # fmt: skip

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.geometry import ascending
+
 _KNOTS = 65
 _COLOR_PARTS, _PARTITIONS, _ROTATIONS = 12, 3, 2  # parts of the guide's space for colours
 _PATCH_PARTS, _FILTERS = 6, 8  # the same for patches; directions per round and axis
@@ -54,7 +56,7 @@ def _quantiles(values: Tensor, rng: np.random.Generator, limit: int = 4096) -> T
         pick = torch.from_numpy((rng.random(limit) * len(values)).astype(np.int64))
         pick = pick.to(values.device)
         values = values[pick]
-    ordered = values.sort(0).values
+    ordered = ascending(values)
     place = torch.linspace(0, len(ordered) - 1, _KNOTS, device=values.device)
     low = place.floor().long().clamp(max=len(ordered) - 1)
     high = (low + 1).clamp(max=len(ordered) - 1)

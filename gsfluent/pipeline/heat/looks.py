@@ -1,0 +1,172 @@
+"""Heat between steps of the grid: it flows at looks of a fixed rate, and points soften by it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.errors import InputError
+from gsfluent.pipeline.heat.ladder import LEVELS, at_level, thermal_of
+from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
+from gsfluent.pipeline.matter.state import State
+from gsfluent.scene.heat import Surroundings
+from gsfluent.scene.scene import Scene
+
+TICK = 1.0 / 60.0
+"""Time between two looks [s]."""
+APART = 2.0
+"""Spacings beyond which two points share no heat: a crack, or melt that has flowed away."""
+TOUCHES = 0.75
+"""Height of a point over the floor, in spacings, at which its cell stands on it."""
+SUPPLE = 0.25
+"""Share of a step of softening by which a point goes past its edge before it goes back."""
+
+
+class _Warm(NamedTuple):
+    """A body that has a temperature."""
+
+    name: str
+    rows: slice
+    links: Tensor  # pairs of its points, from 0
+    faces: Tensor  # open faces at rest
+    table: Tensor  # thermal row, [1, 7]
+    start: float  # degrees C
+
+
+class Heat:
+    """The looks at a scene; without a temperature there are none.
+
+    Args:
+        scene: The scene.
+        matter: Its points, :func:`~gsfluent.pipeline.heat.ladder.thawing`.
+        deterministic: Whether the same bits are wanted.
+
+    Raises:
+        InputError: ``deterministic`` on a GPU, where sums of heat have no order.
+    """
+
+    def __init__(self, scene: Scene, matter: Matter, *, deterministic: bool = False) -> None:
+        self.matter, self.around = matter, scene.heat or Surroundings()
+        self.floor = scene.floor
+        self.spacing = matter.dx / POINTS_PER_CELL ** (1.0 / 3.0)
+        self._warm = []
+        device = matter.particles.device
+        for body, (a, b) in zip(scene.bodies, matter.ranges, strict=True):
+            if body.temperature is None or matter.ladder is None:
+                continue
+            own = matter.rest[a:b].double().cpu() @ body.frame.rotation
+            links, faces = ops.lattice_links(own, self.spacing)
+            table = thermal_of(body.name, body.material).row()[None].to(device)
+            self._warm.append(
+                _Warm(body.name, slice(a, b), links.to(device), faces.to(device), table,
+                      body.temperature)
+            )  # fmt: skip
+        if self._warm and deterministic and device.type == "cuda":
+            raise InputError(
+                "simulate: sums of heat have no order on a GPU, but deterministic was asked for",
+                hint="leave out solve.deterministic, or run on the CPU",
+            )
+
+    def begun(self, state: State) -> State:
+        """The state at time 0 with its heat."""
+        if not self._warm:
+            return state
+        heat = torch.zeros_like(state.position[:, 0])
+        for body in self._warm:
+            start = torch.full_like(heat[body.rows], body.start)
+            heat[body.rows] = ops.enthalpy(start, rows=body.table)
+        return self._softened(state._replace(enthalpy=heat), self._level(heat, None))
+
+    def taken_up(self, state: State) -> State:
+        """A state that was read from a file, with the rows of its heat."""
+        if state.enthalpy is None or not self._warm:
+            return state
+        assert state.level is not None
+        rows = at_level(self.matter, state.level)
+        return state._replace(particles=state.particles.replace(material=rows))
+
+    def next_look(self, time: float) -> float:
+        """Time of the next look [s], or infinity."""
+        return (math.floor(time / TICK + 1e-6) + 1.0) * TICK if self._warm else math.inf
+
+    def look(self, state: State) -> State:
+        """The state after a look; the same at any other time."""
+        if not self._warm or abs(state.time / TICK - round(state.time / TICK)) > 1e-6:
+            return state
+        heat = state.enthalpy
+        assert heat is not None
+        heat = heat.clone()
+        for body in self._warm:
+            heat[body.rows] = self._flowed(body, state, heat[body.rows])
+        return self._softened(state._replace(enthalpy=heat), self._level(heat, state.level))
+
+    def figures(self, state: State) -> dict[str, dict[str, float]]:
+        """Mean temperature [degrees C] and share of the liquid of each body, by mass."""
+        found = {}
+        for body in self._warm:
+            assert state.enthalpy is not None
+            warm, share = ops.temperature(state.enthalpy[body.rows], rows=body.table)
+            mass = state.particles.mass[body.rows].double()
+            mean = (torch.stack([warm, share]) * mass).sum(dim=1) / mass.sum()
+            found[body.name] = {"temperature": float(mean[0]), "liquid": float(mean[1])}
+        return found
+
+    def _flowed(self, body: _Warm, state: State, heat: Tensor) -> Tensor:
+        """Enthalpy of a body's points after a look."""
+        around, place = self.around, state.position[body.rows]
+        a, b = body.links.unbind(dim=1)
+        near = (place[a] - place[b]).norm(dim=1) <= APART * self.spacing
+        links = body.links[near]
+        open_faces = 6 - torch.bincount(links.reshape(-1), minlength=len(heat))
+        wall = None
+        if self.floor is not None:
+            stands = place[:, 2] - self.floor < TOUCHES * self.spacing
+            open_faces = (open_faces - stands.long()).clamp(min=0)
+            if around.floor is not None and bool(stands.any()):
+                at = stands.nonzero()[:, 0]
+                wall = at, torch.full_like(heat[at], around.floor)
+        return ops.conduct(
+            heat, mass=state.particles.mass[body.rows].double(), links=links,
+            spacing=self.spacing, rows=body.table, dt=TICK * around.speed, wall=wall,
+            air=(open_faces.to(heat), around.air, around.transfer),
+        )  # fmt: skip
+
+    def _level(self, heat: Tensor, before: Tensor | None) -> Tensor:
+        """Step of each point from solid to liquid, int8 [N]; what is near an edge stays."""
+        level = torch.zeros_like(heat, dtype=torch.int8)
+        for body in self._warm:
+            share = ops.temperature(heat[body.rows], rows=body.table)[1] * LEVELS
+            now = share.round()
+            if before is not None:
+                old = before[body.rows].to(share)
+                now = torch.where((share - old).abs() <= 0.5 + SUPPLE, old, now)
+            level[body.rows] = now.to(torch.int8)
+        return level
+
+    def _softened(self, state: State, level: Tensor) -> State:
+        """The state with the rows of these levels; what changes leaves its sleep."""
+        p, before = state.particles, state.level
+        rows = at_level(self.matter, level)
+        changed = rows != p.material
+        if not bool(changed.any()):
+            return state._replace(level=level if before is None else before)
+        bulk = self.matter.params[:, 1]
+        # What stiffens keeps its stress and not its strain, or freezing would make energy.
+        ratio = (bulk[p.material.long()] / bulk[rows.long()]).clamp(max=1.0)
+        strain = torch.where(changed[:, None], p.strain * ratio[:, None], p.strain)
+        if before is not None:  # melt that has parted carries no tension, and must get none
+            frozen = (before == LEVELS) & (level < LEVELS)
+            strain = torch.where(frozen[:, None], strain.clamp(max=0.0), strain)
+        bodies = torch.unique(p.body[changed & (state.group >= 0)])
+        woken = torch.isin(p.body, bodies) & (state.group >= 0) & state.asleep
+        return state._replace(
+            particles=p.replace(material=rows, strain=strain),
+            level=level,
+            group=state.group.masked_fill(woken, -1),
+            asleep=state.asleep & ~woken,
+            calm=state.calm.masked_fill(woken, 0),
+        )
