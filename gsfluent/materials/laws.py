@@ -69,7 +69,7 @@ POSITIVE = (
 WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
-    "hysteresis": ("pressed", "both"),
+    "hysteresis": ("pressed", "both", "unloading"),
     "split": ("volumetric", "none", "spectral"),
     "model": ("at1", "at2"),
 }

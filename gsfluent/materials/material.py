@@ -141,7 +141,8 @@ class Material:
         restitution: Speed after over before of a body that lands on a hard floor and stays whole.
         hysteresis: nacc, phase_field: whether what springs back loses energy where it is
             ``pressed``, as dry matter, or in tension too (``both``), as wet tissue: cracks there
-            are fed with less.
+            are fed with less. ``unloading`` (nacc): once per landing, by a spring that is let go
+            by what springs back within ``relaxation_time`` (docs/theory/viscous.md).
         dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
@@ -233,7 +234,17 @@ class Material:
                 f"{', '.join(missing)} is missing",
                 hint="give all three, or none of them and alpha0, hardening and cohesion",
             )
-        if (self.relaxation_share is None) != (self.relaxation_time is None):
+        if self.hysteresis == "unloading" and (
+            self.law != "nacc" or self.relaxation_time is None or self.relaxation_share is not None
+        ):
+            raise InputError(
+                f"material {self.name!r}: hysteresis 'unloading' takes law 'nacc' and "
+                "relaxation_time, and no relaxation_share",
+                hint="the share is 1 - restitution^2; take 'pressed' to go without",
+            )
+        if self.hysteresis != "unloading" and (
+            (self.relaxation_share is None) != (self.relaxation_time is None)
+        ):
             raise InputError(
                 f"material {self.name!r}: {' and '.join(laws.RELAXATION)} go together",
                 hint="give both, or none: then nothing relaxes",
@@ -333,6 +344,10 @@ class Material:
                 changes = {"toughness": self.fracture_energy, **changes}
             else:
                 changes = {**_PLAIN_FIELD, **changes}
+        if self.hysteresis == "unloading" and (
+            law != self.law or changes.get("hysteresis", "unloading") != "unloading"
+        ):
+            changes = {"hysteresis": "pressed", "relaxation_time": None, **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)
@@ -429,26 +444,32 @@ class Material:
         )
         if self.hysteresis == "both":
             row[..., 7] += row[..., 7] > 0.0
+        elif self.hysteresis == "unloading":
+            row[..., 7] = 0.0  # a matter of viscosities
         return row
 
     @property
     def viscous(self) -> bool:
-        """Whether it relaxes, or yields in its own time."""
-        return self.relaxation_share is not None or self.yield_time is not None
+        """Whether it relaxes, lets go of a spring, or yields in its own time."""
+        return self.relaxation_time is not None or self.yield_time is not None
 
     def viscosities(self, sample: Callable[[Field], Tensor] | None = None) -> Tensor:
         """Share of the stiffness that relaxes, rate 1 / tau [1/s], time of a yield [s], [..., 3].
 
-        A softened material takes longer by the root of its softening, as its waves do. Float64.
+        A softened material takes longer by the root of its softening, as its waves do. A negative
+        rate is that of ``hysteresis: unloading`` (:func:`gsfluent.ops.viscous_step`). Float64.
 
         Args:
             sample: As in :meth:`parameters`.
         """
         at, slower = sample or _tensor, self.softening**0.5
         share, tau, time = self.relaxation_share, self.relaxation_time, self.yield_time
+        sign = 1.0
+        if self.hysteresis == "unloading":
+            share, sign = 1.0 - self.restitution**2, -1.0
         columns = (
             at(0.0) if share is None else at(share),
-            at(0.0) if tau is None else 1.0 / (slower * at(tau)),
+            at(0.0) if tau is None else sign / (slower * at(tau)),
             at(0.0) if time is None else slower * at(time),
         )
         return torch.stack(torch.broadcast_tensors(*columns), dim=-1)

@@ -25,7 +25,14 @@ from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
 from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
-from gsfluent.ops.solver_state import DAMAGE_FIELD, MORE_LAWS, UNBROKEN, VISCOUS, SolverState
+from gsfluent.ops.solver_state import (
+    DAMAGE_FIELD,
+    MORE_LAWS,
+    UNBROKEN,
+    VISCOUS,
+    VISCOUS_ANY,
+    SolverState,
+)
 from gsfluent.ops.viscous import check_viscous
 
 ELASTIC, NACC, PHASE = LAWS["elastic"], LAWS["nacc"], LAWS["phase_field"]
@@ -108,8 +115,8 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes. CPU only.
-        viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`); laws 0 and 1
-            only. Default: nothing relaxes and all yields at once, at no cost.
+        viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`), for laws 0 and
+            1; others have none. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
             each other (docs/theory/contact.md, "At a point"); fields of one object touch at nodes.
             Default: all fields do.
@@ -302,14 +309,14 @@ class Solver(SolverState):
         """Choose the kernel of viscous solids; refuse what it does not know."""
         if viscous is None:
             return
-        if not laws <= {ELASTIC, NACC}:
+        if self._law_set in (MORE_LAWS, DAMAGE_FIELD):
             raise InputError(
-                f"Solver: viscous works beside laws 0 and 1 (elastic, nacc) only, got "
+                f"Solver: viscous works beside laws 0 to 4 without plastic viscosity, got "
                 f"{sorted(laws)}",
                 hint="step them by p2g, grid_update, g2p, return_mapping and viscous_step",
             )
         check_viscous("Solver", viscous, like)
-        self._law_set = VISCOUS
+        self._law_set = VISCOUS if laws <= {ELASTIC, NACC} else VISCOUS_ANY
 
     @staticmethod
     def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:

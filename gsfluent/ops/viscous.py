@@ -21,17 +21,17 @@ def check_viscous(op: str, viscous: Tensor, like: Tensor) -> None:
 
     Raises:
         TypeError: Wrong type or dtype.
-        ValueError: Wrong shape or device; a share outside 0 to 1, a rate or a time below 0, values
-            that are not finite.
+        ValueError: Wrong shape or device; a share outside 0 to 1, a time below 0, values that are
+            not finite.
     """
     check_tensor(op, "viscous", viscous, shape=(like.shape[0], 9), like=like)
-    share = viscous[:, SHARE]
-    good = torch.isfinite(viscous).all(dim=1) & (viscous[:, SHARE:] >= 0).all(dim=1) & (share <= 1)
+    share, time = viscous[:, SHARE], viscous[:, TIME]
+    good = torch.isfinite(viscous).all(dim=1) & (share >= 0) & (share <= 1) & (time >= 0)
     if not bool(good.all()):
         row = int((~good).nonzero()[0])
         raise ValueError(
-            f"{op}: viscous must be finite, with a share of 0 to 1, a rate and a time of 0 or "
-            f"more, got {viscous[row, SHARE:].tolist()} in row {row}"
+            f"{op}: viscous must be finite, with a share of 0 to 1 and a time of 0 or more, "
+            f"got {viscous[row, SHARE:].tolist()} in row {row}"
         )
 
 
@@ -40,6 +40,18 @@ def _elastic(law: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
     plain = torch.zeros_like(params)
     plain[:, :2], plain[:, 6] = params[:, :2], params[:, 6]
     return torch.full_like(law, LAWS["elastic"]), plain
+
+
+def _kept_by_unloading(
+    rate: Tensor, stress: Tensor, increment: Tensor, modulus: Tensor, dt: float
+) -> Tensor:
+    """Share of the spring that what springs back leaves; 1 where ``rate`` is not negative."""
+    moved = (increment + increment.transpose(1, 2)).flatten(1)[:, [0, 4, 8, 1, 2, 5]]
+    moved = torch.cat([0.5 * moved[:, :3], moved[:, 3:]], dim=1)
+    work = (stress * moved).sum(dim=1, keepdim=True)
+    slow = (-rate * dt).clamp(min=1e-30) * (_norm2(stress) + 1e-6)
+    kept = 1.0 - (-work * modulus / slow - 1.0).clamp(0.0, 1.0)
+    return torch.where(rate < 0, kept, 1.0)
 
 
 def viscous_step(
@@ -64,7 +76,8 @@ def viscous_step(
     Args:
         viscous: Of each point, [N, 9]: strain of its spring (as ``strain``), its share g of the
             stiffness, 0 to 1, its rate of relaxation 1 / tau [1/s], and the time T of a yield [s],
-            0 for at once.
+            0 for at once. A negative rate: it does not relax, but is let go by what springs back
+            faster than -rate, and a landing returns 1 - g of its energy (Walton and Braun 1986).
         strain: Strain of the law before the step, [N, 6].
         alpha: Its alpha before the step, [N].
         increment: ``dt grad v``, [N, 3, 3].
@@ -104,8 +117,11 @@ def viscous_step(
         yields = (stress != trial_stress).any(dim=1, keepdim=True)
         ratio = _norm2(stress) / _norm2(trial_stress).clamp(min=1e-30)
         left = torch.where(yields, ratio.sqrt().clamp(max=1.0), left)
-    y = 0.5 * dt * rate
+    row = params if material is None else params[material.long()]
+    modulus = row[:, 1:2] + 4.0 / 3.0 * row[:, :1]
+    y = 0.5 * dt * rate.clamp(min=0.0)
     half = 1.0 / (1.0 + y * (1.0 + 0.5 * y))
+    left = left * _kept_by_unloading(rate, stress, increment, modulus, dt)
     spring = left * half * elastic(half * viscous[:, :6], increment)[0]
     spring, held = elastic(spring, none)
     spring = torch.where(share > 0, spring, viscous[:, :6])

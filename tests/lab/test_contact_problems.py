@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.lab.problems.contact import contact, friction, observer
+from gsfluent.lab.problems.contact import contact, friction, observer, placement
 from gsfluent.lab.world.driver import running_on
 from gsfluent.lab.world.registry import Result
 
@@ -66,3 +66,12 @@ def test_block_thrown_along_a_surface_stops() -> None:
 def test_block_rests_on_a_steep_incline_of_high_friction() -> None:
     for result in friction.block_rests():
         holds(result)
+
+
+def test_a_brittle_impact_is_the_same_to_a_moving_observer() -> None:
+    plain, moved = (placement.brittle_impact(3, boost=boost) for boost in (0.0, 0.5))
+    assert 0.05 < plain.broken < 0.5 < plain.lost < 1.0
+    assert moved.lost == pytest.approx(plain.lost, rel=1e-5)
+    assert moved.broken == plain.broken
+    turned = placement.brittle_impact(3, shifted=True, turned=True)
+    assert turned.lost != plain.lost and turned.lost == pytest.approx(plain.lost, rel=0.1)

@@ -228,6 +228,30 @@ def test_what_is_strained_beyond_its_surface_decays_to_it() -> None:
     assert float(stress[0, 3]) == pytest.approx(own + (3e-5 * MU - own) * left, rel=1e-4)
 
 
+def test_what_springs_back_fast_returns_the_rest_of_its_energy() -> None:
+    """A cycle of shear: loaded with the whole stiffness, unloaded with 1 - g of it if fast."""
+    share = torch.tensor([0.0, 0.3, 0.75, 1.0], dtype=torch.float64).repeat(2)
+    steps, amplitude = 500, 1e-4
+    viscous = branch(0.0, 0.0, 8)
+    viscous[:, 6] = share
+    viscous[:4, 7], viscous[4:, 7] = -1.0, -1e6  # unloaded faster, and slower, than that
+    strain = torch.zeros(8, 6, dtype=torch.float64)
+    taken, back, before = (torch.zeros(8, dtype=torch.float64) for _ in range(3))
+    turn = math.pi / steps
+    for i in range(steps):
+        grown = amplitude * (math.sin((i + 1) * turn) - math.sin(i * turn))
+        pull = torch.zeros(8, 3, 3, dtype=torch.float64)
+        pull[:, 0, 1] = grown
+        strain, viscous, stress = step(strain, viscous, pull, 1e-3 / steps)
+        work = 0.5 * (before + stress[:, 3]) * grown
+        taken, back = taken + work.clamp(min=0.0), back - work.clamp(max=0.0)
+        before = stress[:, 3]
+    assert float(before.abs().max()) < 1e-6 * MU  # no set is left
+    given = torch.where(torch.arange(8) < 4, 1.0 - share, 1.0)
+    assert torch.allclose(taken, torch.full_like(taken, 0.5 * MU * amplitude**2), rtol=1e-3)
+    assert float((back / taken - given).abs().max()) < 5e-3
+
+
 # --- the resident solver ---
 
 DX = 0.1
@@ -254,12 +278,13 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 
 
 def relaxing_cube(law: int, dtype: torch.dtype, device: str) -> tuple[dict[str, Tensor], Tensor]:
-    """The cube with its branches: a third does not relax, half yields in its own time."""
+    """The cube with its branches: a third does not relax, a sixth lets go, half yields late."""
     cube = ball(dtype, law)
     n = cube["position"].shape[0]
     start = branch(0.7, 100.0, n).to(dtype)
     start[: n // 3, 6:] = 0.0
     start[::2, 8] = 2e-3
+    start[n // 2 : 2 * n // 3, 7] = -5.0  # what springs back lets go
     if law == NACC:
         cube["alpha"] = torch.where(torch.arange(n) % 3 == 0, -0.05, -0.002).to(dtype)
     return {name: value.to(device) for name, value in cube.items()}, start.to(device)
@@ -372,20 +397,41 @@ def test_the_solver_keeps_order_and_goes_back(device: str, track: bool) -> None:
     assert float((without.position - idle.position).abs().max()) < close * DX
 
 
+@pytest.mark.parametrize("device", DEVICES)
+def test_beside_other_laws_a_spring_does_the_same(device: str) -> None:
+    cube, start = relaxing_cube(NACC, torch.float64, device)
+    alone = stepped(cube, start)
+    n, sand = start.shape[0], LAWS["drucker_prager"]
+    table = {
+        "law": torch.cat([cube["law"], cube["law"].new_tensor([sand])]),
+        "params": cube["params"].repeat(2, 1),
+    }
+    beside = stepped(cube | table, start)  # no point is of sand
+    assert float((alone.position - beside.position).abs().max()) < 1e-12
+    assert alone.viscous is not None and beside.viscous is not None
+    assert float((alone.viscous - beside.viscous).abs().max()) < 1e-12
+    row = (torch.arange(n, device=device) < n // 4).to(torch.int32)
+    mixed = stepped(cube | table | {"material": row}, start)
+    assert mixed.viscous is not None
+    assert torch.equal(mixed.viscous[row == 1], start[row == 1])  # sand has no spring
+    away = (mixed.viscous - start)[n // 2 :, :6].abs()
+    assert float(away.max()) > 1e-4
+
+
 def test_branches_that_are_none_are_refused() -> None:
     cube = ball(torch.float32, ELASTIC)
     n = cube["position"].shape[0]
     good = branch(0.5, 1.0, n).float()
-    for column, value in ((6, -0.1), (6, 1.1), (7, -1.0), (0, math.nan)):
+    for column, value in ((6, -0.1), (6, 1.1), (8, -1.0), (0, math.nan)):
         bad = good.clone()
         bad[3, column] = value
         with pytest.raises(ValueError, match="row 3"):
             ops.Solver(**cube, dx=DX, viscous=bad)
     with pytest.raises(ValueError, match="viscous"):
         ops.Solver(**cube, dx=DX, viscous=good[:5])
-    sand = cube | rows(LAWS["drucker_prager"], torch.float32)
-    with pytest.raises(InputError, match="laws 0 and 1"):
-        ops.Solver(**sand, dx=DX, viscous=good)
+    rubber = cube | rows(LAWS["yeoh"], torch.float32)
+    with pytest.raises(InputError, match="laws 0 to 4"):
+        ops.Solver(**rubber, dx=DX, viscous=good)
 
 
 @pytest.mark.cuda

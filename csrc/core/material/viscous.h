@@ -9,7 +9,8 @@
 
 namespace gsf {
 
-// Of a point: strain of the spring (0 to 5), g, 1 / tau [1/s], and the time T [s] of a yield.
+// Of a point: strain of the spring (0 to 5), g, 1 / tau [1/s], and the time T [s] of a yield. A
+// negative 1 / tau: the spring is let go by what springs back faster than that.
 inline constexpr int kViscousColumns = 9;
 
 // exp(-dt / (2 tau)) to (dt / tau)^3 / 48, between 0 and 1 whatever the step.
@@ -23,6 +24,22 @@ GSF_HOST_DEVICE T half_decay(T rate, T dt) {
 template <typename T>
 GSF_HOST_DEVICE Sym3<T> relaxed_strain(const Sym3<T>& spring, const Mat3<T>& increment, T half) {
   return half * update_strain(half * spring, increment);
+}
+
+// What is left of the spring in a step in which the law gives back what it stored at a rate above
+// -rate: nothing from twice that on. So a landing returns 1 - g of its energy, however long it
+// takes (Walton and Braun 1986: a spring that unloads along another line), and a slow load all of
+// it.
+//   tau   stress of the law [Pa], increment dt grad v, modulus kappa + 4 mu / 3 [Pa]
+template <typename T>
+GSF_HOST_DEVICE T kept_by_unloading(T rate, const Sym3<T>& tau, const Mat3<T>& increment, T modulus,
+                                    T dt) {
+  const Mat3<T>& a = increment;
+  const T work = tau.xx * a(0, 0) + tau.yy * a(1, 1) + tau.zz * a(2, 2) +
+                 tau.xy * (a(0, 1) + a(1, 0)) + tau.xz * (a(0, 2) + a(2, 0)) +
+                 tau.yz * (a(1, 2) + a(2, 1));
+  const T slow = max(T(0) - rate * dt, T(1e-30)) * (norm2(tau) + T(1e-6));
+  return T(1) - clamp(T(0) - work * modulus / slow - T(1), T(0), T(1));
 }
 
 // (1 - g) tau of the law + g tau of the spring.

@@ -17,15 +17,18 @@ inline constexpr double kWeakening = 0.02;
 // Laws a kernel is compiled for: fewer laws, fewer registers.
 // kMoreLaws: those of more_laws.h too; on the CPU only (cpu/solver/solver_more.cpp).
 // kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
-// kViscousBrittle: elastic and NACC with Maxwell branches (on the CPU solver_viscous.cpp).
+// kViscousBrittle, kViscousAny: as kBrittle, kAnyLaw, with springs beside elastic and NACC matter
+// (core/material/viscous.h; on the CPU solver_viscous.cpp).
 enum LawSet : int {
   kElasticOnly = 0,
   kBrittle = 1,
   kAnyLaw = 2,
   kMoreLaws = 3,
   kDamageField = 4,
-  kViscousBrittle = 5
+  kViscousBrittle = 5,
+  kViscousAny = 6
 };
+constexpr bool with_springs(int laws) { return laws == kViscousBrittle || laws == kViscousAny; }
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.
 template <typename T>
@@ -211,7 +214,9 @@ GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T
   }
   if (!(share > T(0))) return;
   Sym3<T> e{own[0], own[1], own[2], own[3], own[4], own[5]};
-  e = left * relaxed_strain(e, increment, half_decay(own[7], dt));
+  if (own[7] < T(0))
+    left *= kept_by_unloading(own[7], out.stress, increment, row[1] + T(4.0 / 3.0) * row[0], dt);
+  e = left * relaxed_strain(e, increment, half_decay(max(own[7], T(0)), dt));
   if (!finite(e)) {
     e = Sym3<T>{};
     out.invalid = true;
@@ -265,7 +270,7 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
 // Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose
 // wave speed may rise by half in one step, else every kWaveSteps (CFL 0.5 leaves room).
 GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
-  return laws == kAnyLaw || laws == kMoreLaws || c.step % kWaveSteps == 0;
+  return laws == kAnyLaw || laws == kMoreLaws || laws == kViscousAny || c.step % kWaveSteps == 0;
 }
 
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
@@ -321,8 +326,9 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
                         : s.law[row];
     ReturnMapped<T> out =
         law_step<T, kLaws>(before.strain, alpha, increment, law, material, s.options, dt);
-    if constexpr (kLaws == kViscousBrittle)
-      viscous_particle(s, p, r, before.strain, alpha, increment, dt, out);
+    if constexpr (with_springs(kLaws))
+      if (law == kElastic || law == kNacc)
+        viscous_particle(s, p, r, before.strain, alpha, increment, dt, out);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -403,8 +409,9 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   ReturnMapped<T> state =
       law_step<T, kLaws>(load_strain(s, p), alpha, none, s.law[row], material, s.options, span);
   const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
-  if constexpr (kLaws == kViscousBrittle)
-    viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), state);
+  if constexpr (with_springs(kLaws))
+    if (s.law[row] == kElastic || s.law[row] == kNacc)
+      viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), state);
   if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;

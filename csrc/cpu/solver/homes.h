@@ -73,7 +73,7 @@ class HomePass {
   Counts from_nodes(int laws) const {
     if (laws == kElasticOnly) return from_nodes<kElasticOnly>();
     if (laws == kMoreLaws) return from_nodes_more();
-    if (laws == kViscousBrittle) return from_nodes_viscous();
+    if (with_springs(laws)) return from_nodes_viscous(laws);
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
@@ -278,7 +278,7 @@ class HomePass {
 
   // In solver_more.cpp, so that the loops here stay as they are compiled.
   Counts from_nodes_more() const;
-  Counts from_nodes_viscous() const;  // in solver_viscous.cpp
+  Counts from_nodes_viscous(int laws) const;  // in solver_viscous.cpp
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;

@@ -84,7 +84,7 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
                             [&](int64_t begin, int64_t end, Counts& counts) {
                               if (laws == kMoreLaws)
                                 return prime_more(s, begin, end, measure, dt, counts.largest);
-                              if (laws == kViscousBrittle)
+                              if (with_springs(laws))
                                 return prime_viscous(s, begin, end, measure, dt, counts.largest);
                               for (int64_t p = begin; p < end; ++p)
                                 prime_particle(s, p, measure, dt, counts.largest);

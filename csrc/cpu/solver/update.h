@@ -173,13 +173,19 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   }
   [[maybe_unused]] Sym3<P> spring;
   [[maybe_unused]] Int relaxes{};
-  if constexpr (kLaws == kViscousBrittle) {
+  if constexpr (with_springs(kLaws)) {
     P four[8];
     packet.load4(s.viscous, kViscousColumns, 0, four);
     packet.load4(s.viscous, kViscousColumns, 4, four + 4);
     relaxes = four[6] > P(0);
     spring = relaxed_strain(Sym3<P>{four[0], four[1], four[2], four[3], four[4], four[5]},
-                            increment, half_decay(four[7], P(dt)));
+                            increment, half_decay(max(four[7], P(0)), P(dt)));
+    if (mask_bits(four[7] < P(0)) != 0)
+      spring = select<T>(four[7] < P(0),
+                         kept_by_unloading(four[7], stress, increment,
+                                           row[1] + P(4.0 / 3.0) * row[0], P(dt)),
+                         P(1)) *
+               spring;
     const P change = det_minus_one(spring);
     const Sym3<P> away = reciprocal_cube_root(P(1) + change) * deviator(spring);
     plain &= ~relaxes |
@@ -238,7 +244,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         const int lane = __builtin_ctz(left);
         s.alpha[packet.index[lane]] = history[lane];
       }
-    if constexpr (kLaws == kViscousBrittle) {
+    if constexpr (with_springs(kLaws)) {
       const uint32_t kept = done & mask_bits(relaxes);
       const P first[4] = {spring.xx, spring.yy, spring.zz, spring.xy};
       const P last[4] = {spring.zz, spring.xy, spring.xz, spring.yz};

@@ -8,9 +8,7 @@ namespace {
 constexpr int kThreads = kSolverThreads;
 constexpr int kG2PThreads = 128;  // as kP2GThreads
 // CTAs of a multiprocessor: more for the laws that need fewer registers.
-constexpr int g2p_ctas(int laws) {
-  return laws == kElasticOnly ? 7 : (laws == kViscousBrittle ? 5 : 6);
-}
+constexpr int g2p_ctas(int laws) { return laws == kElasticOnly ? 7 : (with_springs(laws) ? 5 : 6); }
 
 // Brings the line at p near; nothing waits for it.
 __device__ inline void prefetch(const void* p) {
@@ -169,8 +167,8 @@ template <typename T>
 cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
   for (const bool measure : {true, false})
-    if (law_set == kViscousBrittle)
-      prime_kernel<T, kViscousBrittle><<<homes, kThreads, 0, stream>>>(s, measure);
+    if (with_springs(law_set))
+      prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
     else
       prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
   return cudaGetLastError();
@@ -204,6 +202,10 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     g2p_kernel<T, kViscousBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (law_set == kViscousBrittle)
     g2p_kernel<T, kViscousBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+  else if (law_set == kViscousAny && !track)
+    g2p_kernel<T, kViscousAny, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+  else if (law_set == kViscousAny)
+    g2p_kernel<T, kViscousAny, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else if (!track)
     g2p_kernel<T, kAnyLaw, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
   else

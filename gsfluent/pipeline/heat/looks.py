@@ -158,6 +158,9 @@ class Heat:
         # What stiffens keeps its stress and not its strain, or freezing would make energy.
         ratio = (bulk[p.material.long()] / bulk[rows.long()]).clamp(max=1.0)
         strain = torch.where(changed[:, None], p.strain * ratio[:, None], p.strain)
+        if before is not None:  # melt that has parted carries no tension, and must get none
+            frozen = (before == LEVELS) & (level < LEVELS)
+            strain = torch.where(frozen[:, None], strain.clamp(max=0.0), strain)
         bodies = torch.unique(p.body[changed & (state.group >= 0)])
         woken = torch.isin(p.body, bodies) & (state.group >= 0) & state.asleep
         return state._replace(

@@ -21,6 +21,7 @@ from gsfluent.errors import InputError
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
+from gsfluent.ops.plasticity import compiled_apart
 from gsfluent.ops.reference import touch
 from gsfluent.ops.solver_buffers import MAX_FIELDS
 from gsfluent.pipeline.colliders.blades import BladeSet
@@ -71,10 +72,10 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
     known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
     if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
         return False  # not there yet
-    if matter.viscous:
-        known = matter.law.new_tensor([LAWS["elastic"], LAWS["nacc"]])
-        if not bool(torch.isin(matter.law, known).all()):
-            return False  # not there yet
+    if matter.viscous and (
+        matter.has_field or bool(compiled_apart(matter.law, matter.params).any())
+    ):
+        return False  # not there yet
     if not rigid.frees:
         return True
     mass = rows[:, columns.MASS]

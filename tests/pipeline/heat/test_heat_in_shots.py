@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 import gsfluent as gf
-from gsfluent.config import Shot
+from gsfluent.config import Shot, load_shot
 from gsfluent.data import INTERIOR, Frame, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.lab.problems.heat.melting import stefan_number
@@ -95,6 +96,19 @@ def test_what_freezes_keeps_its_stress_and_energy_falls() -> None:
     assert torch.allclose(hard.particles.strain, squeezed / LEVELS, rtol=1e-4)
     assert torch.allclose(after, before / LEVELS, rtol=1e-2)
     assert torch.equal(hard.particles.material, run.matter.particles.material)
+
+
+def test_melt_that_has_parted_freezes_without_tension() -> None:
+    run = gf.pipeline.Simulate(dx=0.005).run_of(scene_of("wax", 80.0), 10.0)
+    state, count = run.state, run.state.particles.count
+    assert state.level is not None and int(state.level.min()) == LEVELS
+    strain = torch.zeros(count, 6)
+    strain[:, :3] = torch.linspace(-0.01, 0.1, count)[:, None]
+    state = state._replace(particles=state.particles.replace(strain=strain))
+    before = run.matter.stored(state.particles, state.peak)
+    solid = run.heat._softened(state, torch.full((count,), LEVELS - 1, dtype=torch.int8))
+    after = run.matter.stored(solid.particles, solid.peak)
+    assert bool((after <= before + 1e-12).all())
 
 
 def test_steps_are_the_solid_made_weaker_and_then_a_liquid() -> None:
@@ -182,6 +196,16 @@ def test_a_shot_names_temperatures(tmp_path) -> None:  # type: ignore[no-untyped
     ):
         with pytest.raises(InputError, match=words):
             Shot.from_dict({**values, **wrong}, tmp_path)
+
+
+def test_the_example_reads(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    text = (Path(__file__).resolve().parents[3] / "examples" / "chocolate_melted.yaml").read_text()
+    (tmp_path / "data/chocolate/photographs").mkdir(parents=True)
+    (tmp_path / "data/chocolate/cut.png").touch()
+    (tmp_path / "shot.yaml").write_text(text)
+    shot = load_shot(tmp_path / "shot.yaml")
+    assert shot.objects["bar"].temperature == 24.0
+    assert shot.heat is not None and shot.heat.speed == 400.0
 
 
 @pytest.mark.cuda

@@ -153,6 +153,32 @@ def test_a_melon_that_relaxes_breaks_all_the_same(device: str) -> None:
     assert bool(torch.isfinite(frames[-1].particles.viscous).all())
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("restitution", [0.5, 0.7])
+def test_a_ball_that_lets_go_rebounds_with_its_restitution(restitution: float, device: str) -> None:
+    ball = BALL.override(
+        hysteresis="unloading", restitution=restitution, relaxation_time=100.0 * SPAN
+    )
+    stage = Simulate(dx=2.0 * RADIUS / 10, splats=False, device=device)
+    made = stage(dropped(ball), fps=100, seconds=math.sqrt(0.2 / 9.81) + 0.06)
+    frames, report = list(made), made.report
+    assert report["verdict"] == "clean", report["reason"]
+    assert report["rollbacks"] == 0 and report["composed_steps"] == 0
+    assert rebound(frames) == pytest.approx(restitution, abs=0.08)
+
+
+def test_what_lets_go_is_told_by_restitution_and_a_time() -> None:
+    plaster = materials.plaster
+    assert float(plaster.parameters()[7]) == 0.0
+    wanted = [1.0 - plaster.restitution**2, -0.1 / plaster.relaxation_time, 0.0]
+    assert plaster.viscosities().tolist() == pytest.approx(wanted)
+    for law in ("phase_field", "elastic"):
+        assert plaster.override(law=law).hysteresis == "pressed"
+    for change in ({"relaxation_share": 0.5}, {"relaxation_time": None}):
+        with pytest.raises(InputError, match="unloading"):
+            plaster.override(**change)
+
+
 def test_half_of_the_two_numbers_is_refused() -> None:
     with pytest.raises(InputError, match="go together"):
         BALL.override(relaxation_share=0.5)
