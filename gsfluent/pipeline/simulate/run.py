@@ -35,6 +35,9 @@ MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
 REGROUP = 64
 """Grid steps between two looks for new pieces within a frame."""
+MOVED = 0.25
+"""Cells that something must have moved for such a look: pieces that have not parted need none. Stiff
+things take thousands of steps for that."""
 LOOKS = 240.0
 """Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
 Hook = Callable[[State], State]
@@ -137,7 +140,7 @@ class Run:
         state = bounded(state)
         watch.keep(state, only=True)
         checked = grouped = state.step
-        broken = self._broken(state)
+        broken, looked = self._broken(state), state.time
         while state.time < until:
             trouble: Unhealthy | None = None
             try:
@@ -164,10 +167,11 @@ class Run:
                     return False
                 state = back
                 checked = grouped = state.step
+                looked = min(looked, state.time)
             elif state.step - grouped >= REGROUP and checked == state.step:
                 grouped = state.step
-                if broken != self._broken(state):
-                    state = self._regroup(state, at_frame=False)
+                if broken != self._broken(state) and self._moved(state, looked):
+                    state, looked = self._regroup(state, at_frame=False), state.time
                     broken = self._broken(state)  # some may have been welded
         self.state = state
         waits = [body.held and body.start > state.time for body in self.scene.bodies]
@@ -175,6 +179,11 @@ class Run:
             self.failure = watch.verdict(frame)
         self.seconds += clock.perf_counter() - begun
         return not self.failure
+
+    def _moved(self, state: State, since: float) -> bool:
+        """Whether anything can have moved by a part of a cell since a time."""
+        fastest = float(state.particles.velocity.norm(dim=1).max())
+        return not fastest * (state.time - since) < MOVED * self.matter.dx
 
     def _broken(self, state: State) -> int:
         return int((state.peak >= 0).sum())

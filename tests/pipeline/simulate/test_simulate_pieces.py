@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.simulate.debris import RigidChips, let_go, near_matter, tumble
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.health import figures_of
-from gsfluent.pipeline.simulate.run import Run
+from gsfluent.pipeline.simulate.run import MOVED, REGROUP, Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
 
@@ -234,3 +235,26 @@ def test_chips_leave_the_grid_with_all_their_momentum_and_hold_no_block() -> Non
     assert pieces.count == 1 and pieces.labels[chip].eq(-1).all()
     apart = [(x[chip][:, None] - x[chip][None]).norm(dim=2) for x in (run.state.position, rest)]
     assert float((apart[0] - apart[1]).abs().max()) < 1e-6
+
+
+def test_pieces_are_looked_for_as_often_as_anything_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stiff matter takes many steps in which nothing gets anywhere."""
+    scene = Scene(floor=0.0)
+    stiff = dataclasses.replace(materials.fruit.watermelon, young_modulus=2e8)
+    scene.add(ellipsoid((0.06,) * 3), stiff)
+    scene.drop(0.2)
+    scene.throw((0.0, 0.0, -12.0))
+    run = Simulate(dx=DX, splats=False).run_of(scene, fps=10)
+    whole, looks = run._regroup, []
+
+    def counted(state: State, *, at_frame: bool = True) -> State:
+        if not at_frame:
+            looks.append((state.step, float(state.particles.velocity.norm(dim=1).max())))
+        return whole(state, at_frame=at_frame)
+
+    monkeypatch.setattr(run, "_regroup", counted)
+    assert all(run.advance_to(frame, None) for frame in range(2))
+    steps, fastest = run.state.step, max(speed for _, speed in looks)
+    far = fastest * run.state.time / (MOVED * DX)
+    assert 1 <= len(looks) <= 1 + far
+    assert len(looks) < 0.5 * steps / REGROUP  # as often as there were steps for
