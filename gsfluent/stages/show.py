@@ -19,6 +19,7 @@ from gsfluent.pipeline.render.figures import FilmFigures
 from gsfluent.pipeline.render.film import Film, poster_frame
 from gsfluent.pipeline.render.video import to_bytes, write_video
 from gsfluent.progress import Progress, report_progress
+from gsfluent.results.behind import Behind
 from gsfluent.results.digests import require_intact
 from gsfluent.results.record import shot_of
 from gsfluent.results.store import content_digest, publish
@@ -50,14 +51,15 @@ def render_stage(context: RunContext) -> None:
                 made = film.picture(frame)
                 picture = to_bytes(made.image)
                 drawing += time.perf_counter() - start
-                figures.add(frame, film.cameras[frame.index], made.alpha, made.depth)
+                camera = film.cameras[frame.index]
+                beside.do(figures.add, frame, camera, made.alpha, made.depth)
                 counts.append(int(frame.facts.get("fragments", 1)))
                 report_progress(progress, frame.index + 1, len(film), "")
                 yield picture
 
-        write_video(
-            folder / "video.mp4", pictures(), fps=shot.output.video_fps, size=shot.output.size
-        )
+        video = folder / "video.mp4"
+        with Behind() as beside:  # a frame is measured while the next is drawn
+            write_video(video, pictures(), fps=shot.output.video_fps, size=shot.output.size)
         report |= figures.report()
         report["seconds_per_frame"] = drawing / len(film)
         report["poster_frame"] = poster_frame(counts, shot.output.fps)

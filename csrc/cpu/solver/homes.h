@@ -1,6 +1,8 @@
 // Particles of the resident solver on the CPU, home by home: to the nodes of its window and back.
 #pragma once
 
+#include <bit>
+
 #include "cpu/contact/points.h"
 #include "cpu/solver/surface.h"
 #include "cpu/solver/update.h"
@@ -10,16 +12,20 @@ namespace gsf::cpu {
 constexpr int64_t kHomeGrain = 4;
 constexpr int kColors = 8;  // windows of homes two blocks apart share no node
 
-// Cells of a window in order, by the nine bits of l in a meta word.
+// Cells of a window in order, by the nine bits of l in a meta word, and the l of each axis as one
+// bit of a byte.
 constexpr int kCells = (kLastCell + 1) * (kLastCell + 1) * (kLastCell + 1);
 struct CellTable {
   uint8_t at[512];
-  constexpr CellTable() : at{} {
+  uint32_t places[512];
+  constexpr CellTable() : at{}, places{} {
     for (uint32_t word = 0; word < 512; ++word) {
       int cell = 0;
       for (int axis = 0; axis < 3; ++axis) {
-        const int l = static_cast<int>(word >> (3 * axis) & 7u);
-        cell = cell * (kLastCell + 1) + (l < kLastCell ? l : kLastCell);
+        const int stored = static_cast<int>(word >> (3 * axis) & 7u);
+        const int l = stored < kLastCell ? stored : kLastCell;
+        cell = cell * (kLastCell + 1) + l;
+        places[word] |= 1u << (8 * axis + l);
       }
       at[word] = static_cast<uint8_t>(cell);
     }
@@ -116,23 +122,18 @@ class HomePass {
   void sort_home(int64_t h, const Range& r) {
     const auto cell = [&](int64_t p) { return kCellOf.at[s_.meta[p] & 511u]; };
     int32_t next[kCells + 1] = {};
-    for (int64_t p = r.begin; p < r.end; ++p) ++next[cell(p) + 1];
-    int lo[3] = {kLastCell, kLastCell, kLastCell}, hi[3] = {0, 0, 0};
-    for (int c = 0; c < kCells; ++c) {
-      if (next[c + 1] > 0) {
-        const int l[3] = {c / 36, c / 6 % 6, c % 6};
-        for (int axis = 0; axis < 3; ++axis) {
-          lo[axis] = std::min(lo[axis], l[axis]);
-          hi[axis] = std::max(hi[axis], l[axis] + 3);
-        }
-      }
-      next[c + 1] += next[c];
+    uint32_t places = 0;
+    for (int64_t p = r.begin; p < r.end; ++p) {
+      ++next[cell(p) + 1];
+      places |= kCellOf.places[s_.meta[p] & 511u];
     }
+    for (int c = 0; c < kCells; ++c) next[c + 1] += next[c];
     for (int64_t p = r.begin; p < r.end; ++p)
       s_.entry[r.begin + next[cell(p)]++] = static_cast<int32_t>(p);
     for (int axis = 0; axis < 3; ++axis) {
-      box_[h].lo[axis] = static_cast<int8_t>(lo[axis]);
-      box_[h].hi[axis] = static_cast<int8_t>(hi[axis]);
+      const uint32_t mine = places >> (8 * axis) & 255u;
+      box_[h].lo[axis] = static_cast<int8_t>(std::countr_zero(mine));
+      box_[h].hi[axis] = static_cast<int8_t>(std::bit_width(mine) + 2);  // last cell + 3
     }
   }
 

@@ -136,7 +136,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
       const Int holds = surely_elastic(row, cohesion, alpha, j2m1, n2);
       whole &= ~nacc | (peak < P(0));
-      if constexpr (kLaws != kViscousBrittle) {
+      if constexpr (!with_springs(kLaws)) {
         softens = plain & nacc & ~holds & (alpha >= P(0)) & (alpha <= P(kAlphaMax)) &
                   (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin));
         if (s.options.k == T(2) && mask_bits(softens) != 0) {
@@ -230,7 +230,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const int lane = __builtin_ctz(left);
       s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
     }
-    if constexpr (kLaws != kElasticOnly && kLaws != kViscousBrittle) {
+    if constexpr (kLaws != kElasticOnly && !with_springs(kLaws)) {
       const uint32_t yielding = done & mask_bits(softens);
       counts.plastic += __builtin_popcount(yielding);
       for (uint32_t left = yielding; left != 0; left &= left - 1) {
