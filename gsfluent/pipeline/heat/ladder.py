@@ -46,7 +46,7 @@ def thermal_of(name: str, material: Material) -> Thermal:
             f"{name!r} has a temperature, but law {material.law!r} cannot melt",
             hint=f"use law {', '.join(SOFTENED)}, or leave out the temperature",
         )
-    if material.relaxation_share is not None or material.yield_time is not None:
+    if material.viscous:
         raise InputError(
             f"{name!r} has a temperature, but viscous matter cannot melt",
             hint="leave out the temperature, or relaxation_share, relaxation_time and yield_time",
