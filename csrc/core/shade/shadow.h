@@ -11,6 +11,8 @@ namespace gsf {
 constexpr int kSearchTaps = 16;
 constexpr int kFilterTaps = 32;
 constexpr double kLeastSearch = 2.0;  // texels
+constexpr double kNarrower = 4.0;  // times: what the looks at a wide disc miss, a narrow one meets
+constexpr int kNarrowings = 4;
 constexpr double kLeastFilter = 1.2;
 constexpr double kMostSpread = 0.25;  // of the map's side
 constexpr double kSure = 0.3;         // opacity from which a blocker counts for the deepest one
@@ -197,17 +199,21 @@ GSF_HOST_DEVICE T shadow_transmittance(const ShadeArgs<T>& a, const T* lamp, con
   T search = lamp[9] * (view.depth - closest) * view.per_depth;
   if (is_point) search = search / max(closest, T(kTinyLength));
   search = clamp(search, T(kLeastSearch), most);
-#ifndef __CUDA_ARCH__
-  if (a.blockers != nullptr) {
-    const int pitch = blocker_blocks(a.texels) + 1;
-    if (!may_block(a.blockers + int64_t(face) * pitch * pitch, a.texels, view.x, view.y, search))
-      return T(1);
-  }
-#endif
   const Taps taps(a, face, view);
   T weight = T(0), total = T(0), deepest = T(0);
-  taps.search(search, weight, total, deepest);
-  if (!(weight > T(0))) return T(1);
+  for (int narrowing = 0;; ++narrowing, search = max(search / T(kNarrower), T(kLeastSearch))) {
+#ifndef __CUDA_ARCH__
+    if (a.blockers != nullptr) {
+      const int pitch = blocker_blocks(a.texels) + 1;
+      if (!may_block(a.blockers + int64_t(face) * pitch * pitch, a.texels, view.x, view.y, search))
+        return T(1);
+    }
+#endif
+    taps.search(search, weight, total, deepest);
+    if (weight > T(0)) break;
+    // Something high above widens the disc for all that lies below it.
+    if (narrowing == kNarrowings || !(search > T(kLeastSearch))) return T(1);
+  }
   // Of what a lamp sees of a body the rim, which limits the light, is deepest.
   const T mean = total / max(weight, T(kTinyLength));
   const T blocker = T(0.5) * (mean + max(mean, deepest));

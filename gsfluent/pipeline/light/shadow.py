@@ -21,6 +21,9 @@ FILTER_TAPS = 32
 # staircase of the map's texels).
 LEAST_SEARCH = 2.0
 LEAST_FILTER = 1.2
+# Where the looks at a disc of that size meet nothing, discs this many times narrower are searched,
+# this often.
+NARROWER, NARROWINGS = 4.0, 4
 # Share of the map's side: the largest disc.
 MOST_SPREAD = 0.25
 # A blocker this opaque counts for the deepest one: of a body, what limits the light is its rim, and
@@ -115,16 +118,19 @@ def transmittance(
     search = lamp[9] * (depth - closest) * per_depth
     search = torch.where(point, search / closest.clamp(min=_TINY), search)
     search = search.clamp(LEAST_SEARCH, most)
-    weight, total = torch.zeros_like(depth), torch.zeros_like(depth)
-    deepest = torch.zeros_like(depth)
-    for a, b in disc(SEARCH_TAPS):
-        du, dv = a * search, b * search
-        index = at((x + du).floor(), (y + dv).floor())
-        found = flat_depth[index]
-        before = (own_depth(du, dv) - bias - found) * hardness
-        share = flat_alpha[index] * before.clamp(0.0, 1.0)
-        weight, total = weight + share, total + share * found
-        deepest = torch.maximum(deepest, torch.where(share > SURE, found, 0.0))
+    weight, total, deepest = (torch.zeros_like(depth) for _ in range(3))
+    for _ in range(NARROWINGS + 1):
+        # something high above widens the disc for all that lies below it, and its looks miss that
+        lost = ~(weight > 0.0)
+        for a, b in disc(SEARCH_TAPS):
+            du, dv = a * search, b * search
+            index = at((x + du).floor(), (y + dv).floor())
+            found = flat_depth[index]
+            before = (own_depth(du, dv) - bias - found) * hardness
+            share = torch.where(lost, flat_alpha[index] * before.clamp(0.0, 1.0), 0.0)
+            weight, total = weight + share, total + share * found
+            deepest = torch.maximum(deepest, torch.where(share > SURE, found, 0.0))
+        search = (search / NARROWER).clamp(min=LEAST_SEARCH)
     mean = total / weight.clamp(min=_TINY)
     blocker = 0.5 * (mean + torch.maximum(mean, deepest))
     spread = lamp[9] * (depth - blocker).clamp(min=0.0) * per_depth

@@ -36,8 +36,8 @@ MOMENTUM_BAR = 1e-4
 REGROUP = 64
 """Grid steps between two looks for new pieces within a frame."""
 MOVED = 0.25
-"""Cells that something must have moved for such a look: pieces that have not parted need none. Stiff
-things take thousands of steps for that."""
+"""Cells that something must have moved for such a look: pieces that have not parted need none, and
+stiff things take thousands of steps for that."""
 LOOKS = 240.0
 """Looks for new pieces, and for what may leave the grid, in a simulated second at most."""
 Hook = Callable[[State], State]

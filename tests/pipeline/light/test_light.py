@@ -490,3 +490,22 @@ def test_picture_is_the_same_on_the_gpu(skin: Gaussians, position: Any) -> None:
     host = Render(camera, light, studio=studio)(skin).image
     device = Render(camera, light, studio=studio)(skin.to(torch.device("cuda"))).image.cpu()
     assert float((host - device).abs().mean()) < 2e-3
+
+
+@pytest.mark.parametrize("nearest", [1.9, 1.0, 0.5])
+@pytest.mark.parametrize("radius", [0.1, 0.3])
+def test_what_lies_low_keeps_its_shadow_under_what_flies_high(
+    radius: float, nearest: float
+) -> None:
+    """A plate 4 cm over a floor, below a lamp 2 m up; the highest thing is ``nearest`` from it."""
+    side, focal, low = 512, 600.0, 1.96
+    along = ((torch.arange(side) + 0.5 - 0.5 * side) / focal * low).abs() < 0.03
+    plate = along[:, None] & along
+    camera = torch.tensor([1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, -1.0, 2.0, focal, nearest, 0.004])
+    maps = ShadowMaps(torch.where(plate, low, 1e6)[None], plate[None].float(), camera[None])
+    lamp = torch.zeros(12)
+    lamp[0], lamp[9], lamp[11] = 1.0, radius, 1.0
+    floor = torch.tensor([[0.0, 0.0, 0.0], [0.02, -0.01, 0.0], [0.1, 0.1, 0.0]])
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(3, 3)
+    light = transmittance(floor, up, lamp, maps)
+    assert light[:2].tolist() == pytest.approx([0.0, 0.0], abs=1e-5) and float(light[2]) == 1.0
