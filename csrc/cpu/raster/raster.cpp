@@ -22,10 +22,10 @@ void with_variant(int features, bool groups, const F& f) {
       f.template operator()<kF, false>();
   };
   if constexpr (sizeof(T) == sizeof(float)) {
-    if (features == 3) return choose.template operator()<3>();    // rgb
-    if (features == 4) return choose.template operator()<4>();    // rgb, depth
-    if (features == 7) return choose.template operator()<7>();    // rgb, normal, depth
-    if (features == 9) return choose.template operator()<9>();    // and the gloss of a splat
+    if (features == 3) return choose.template operator()<3>();  // rgb
+    if (features == 4) return choose.template operator()<4>();  // rgb, depth
+    if (features == 7) return choose.template operator()<7>();  // rgb, normal, depth
+    if (features == 9) return choose.template operator()<9>();  // and the gloss of a splat
   }
   choose.template operator()<0>();
 }
