@@ -7,6 +7,16 @@
 
 namespace gsf {
 
+// Row of each particle in a table of `rows` rows, int32 [N]; may be absent where there is one row
+// or one for each.
+inline OptTensor ready_material(const char* op, const OptTensor& material, int64_t rows,
+                                const Tensor& strain) {
+  const int64_t n = strain.size(0);
+  STD_TORCH_CHECK(material || rows == 1 || rows == n, op,
+                  ": without material, params must have 1 or N rows, got ", rows);
+  return ready(op, "material", material, strain, {n}, ScalarType::Int);
+}
+
 template <class Backend>
 struct PlasticityOps {
   static std::tuple<Tensor, Tensor, Tensor, Tensor> return_mapping(
@@ -30,18 +40,11 @@ struct PlasticityOps {
     check_same_device(op, "increment", increment, strain);
     check_same_device(op, "law", law, strain);
     check_same_device(op, "params", params, strain);
-    if (material) {
-      check_shape(op, "material", *material, {n});
-      check_dtype(op, "material", *material, ScalarType::Int);
-      check_same_device(op, "material", *material, strain);
-    }
-    STD_TORCH_CHECK(material || rows == 1 || rows == n, op,
-                    ": without material, params must have 1 or N rows, got ", rows);
+    const OptTensor mat = ready_material(op, material, rows, strain);
 
     const Tensor e = gsf::contiguous(strain), a = gsf::contiguous(alpha),
                  inc = gsf::contiguous(increment), l = gsf::contiguous(law),
                  par = gsf::contiguous(params);
-    const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
     Tensor strain_out = gsf::new_empty(e, {n, 6}, dtype);
     Tensor alpha_out = gsf::new_empty(e, {n}, dtype);
     Tensor stress_out = gsf::new_empty(e, {n, 6}, dtype);
@@ -76,19 +79,10 @@ struct PlasticityOps {
     check_shape(op, "strain", strain, {-1, 6});
     const int64_t n = strain.size(0);
     const ScalarType dtype = strain.scalar_type();
-    check_shape(op, "params", params, {-1, kParamColumns});
-    check_dtype(op, "params", params, dtype);
-    check_same_device(op, "params", params, strain);
+    const Tensor e = gsf::contiguous(strain),
+                 par = ready(op, "params", params, strain, {-1, kParamColumns});
     const int64_t rows = params.size(0);
-    if (material) {
-      check_shape(op, "material", *material, {n});
-      check_dtype(op, "material", *material, ScalarType::Int);
-      check_same_device(op, "material", *material, strain);
-    }
-    STD_TORCH_CHECK(material || rows == 1 || rows == n, op,
-                    ": without material, params must have 1 or N rows, got ", rows);
-    const Tensor e = gsf::contiguous(strain), par = gsf::contiguous(params);
-    const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
+    const OptTensor mat = ready_material(op, material, rows, strain);
     Tensor energy = gsf::new_empty(e, {n}, dtype);
     const typename Backend::Scope scope(e);
     dispatch_floating(op, e, [&]<typename T>() {

@@ -16,8 +16,8 @@ class Behind:
     """A thread that does what it is given, one thing after the other.
 
     What goes wrong there is raised by the next call here, and what was given after it is left
-    undone. Leaving the ``with`` block waits for all
-    that was given; an error of the block itself comes first.
+    undone. Leaving the ``with`` block waits for all that was given; an error of the block itself
+    comes first.
 
     Args:
         room: How much may wait, what is being done among it.

@@ -1,6 +1,6 @@
 // CPU kernel of return_mapping_adjoint: gradients of particles, and which of them it could not do.
 #include "core/material/return_gradient.h"
-#include "torch_api.h"
+#include "host/plasticity.h"
 
 namespace gsf {
 namespace {
@@ -27,13 +27,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> return_mapping_adjoint(
                e = ready("strain", strain, {n, 6}), a = ready("alpha", alpha, {n}),
                inc = ready("increment", increment, {n, 3, 3}),
                par = ready("params", params, {rows, kParamColumns}), l = gsf::contiguous(law);
-  if (material) {
-    check_shape(op, "material", *material, {n});
-    check_dtype(op, "material", *material, ScalarType::Int);
-  }
-  const OptTensor mat = material ? OptTensor(gsf::contiguous(*material)) : OptTensor();
-  STD_TORCH_CHECK(mat || rows == 1 || rows == n, op,
-                  ": without material, params must have 1 or N rows, got ", rows);
+  const OptTensor mat = ready_material(op, material, rows, strain);
   const Tensor out_strain = new_zeros(e, {n, 6}, dtype), out_alpha = new_zeros(e, {n}, dtype),
                out_increment = new_zeros(e, {n, 3, 3}, dtype),
                out_params = new_zeros(e, {n, kGradientColumns}, dtype),

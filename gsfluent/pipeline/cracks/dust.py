@@ -26,7 +26,7 @@ from gsfluent.data import SPRAY, Gaussians
 from gsfluent.pipeline.cracks.gaps import Births
 from gsfluent.pipeline.matter.pieces import dust_limit
 from gsfluent.pipeline.matter.points import Matter
-from gsfluent.pipeline.partition.chips import hashed
+from gsfluent.pipeline.partition.chips import hashed, hashes
 from gsfluent.results.frames import DUST
 from gsfluent.scene.scene import Scene
 
@@ -316,16 +316,14 @@ def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
     toward = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1)
     out = (0.5 + 0.5 * hashed(seed, 3))[:, None] * toward
     lag = (0.5 + 0.5 * hashed(seed, 12)) * (1.0 - (size / _largest(least)).clamp(max=1.0))
-    cell = torch.stack([hashed(seed, 4 + axis) for axis in range(3)], dim=1)
-    offset = 0.5 * cell * edge.double().repeat_interleave(count)[:, None]
+    offset = 0.5 * hashes(seed, range(4, 7)) * edge.double().repeat_interleave(count)[:, None]
     draw = (0.5 + 0.5 * hashed(seed, 7))[:, None]
     shape = 1.0 + draw * (draw.new_tensor(WET if wet else POWDER) - 1.0)
     shape = shape / shape.prod(dim=1, keepdim=True).pow(1.0 / 3.0)
     if wet:
         quats = _along(toward)
     else:
-        quats = torch.stack([hashed(seed, 8 + i) for i in range(4)], dim=1)
-        quats = torch.nn.functional.normalize(quats + 1e-6, dim=1)
+        quats = torch.nn.functional.normalize(hashes(seed, range(8, 12)) + 1e-6, dim=1)
     size = size * edge.double().repeat_interleave(count)
     scales = (SIGMA * 0.5) * size[:, None] * shape
     offset, out, lag, quats, scales = (

@@ -159,14 +159,12 @@ class Moment:
     """A frame that has been reached and is not wrapped up yet, while the run may go on.
 
     Args:
-        index: Frame number.
         frame: Wraps it up. From any thread, once for each frame and in their order, because the
             repair of cracks remembers what came before.
         save: Writes the state of this moment to a file, after ``frame`` and before that of the
             next one (:meth:`Simulation.save`).
     """
 
-    index: int
     frame: Callable[[], SimulationFrame]
     save: Callable[[str | Path], None]
 
@@ -212,9 +210,7 @@ class Simulation(Iterator[SimulationFrame]):
             frame = moment_of(run, index, history)
         report_progress(self._progress, index + 1, self.count, f"t = {index / run.fps:.3f} s")
         kept = run.kept()
-        return Moment(
-            index, frame, lambda path: kept(path, {} if history is None else history.state())
-        )
+        return Moment(frame, lambda path: kept(path, self._repair_state()))
 
     def save(self, path: str | Path) -> None:
         """Write the state of the last frame, to be given to ``resume`` of :class:`Simulate`.
@@ -224,7 +220,10 @@ class Simulation(Iterator[SimulationFrame]):
         """
         if self.run.next_frame == 0:
             raise InputError("simulate: there is no frame to save", hint="take a frame first")
-        self.run.save(path, {} if self.history is None else self.history.state())
+        self.run.save(path, self._repair_state())
+
+    def _repair_state(self) -> dict[str, Any]:
+        return {} if self.history is None else self.history.state()
 
     @property
     def report(self) -> dict[str, Any]:

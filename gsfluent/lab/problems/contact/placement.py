@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator
 
@@ -27,6 +28,7 @@ class Outcome:
     broken: float
 
 
+@functools.cache  # as it lies, at rest and by usual steps it is asked for by every problem
 def brittle_impact(
     seed: int, *, shifted: bool = False, turned: bool = False, boost: float = 0.0, cfl: float = 0.5
 ) -> Outcome:
