@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent.pipeline.matter.fragments import ranked
 from gsfluent.pipeline.partition.threshold import CHIP
-from gsfluent.pipeline.partition.tree import ranked
 from gsfluent.spatial.neighbours import nearest_in_group
 
 PART = 3

@@ -9,5 +9,5 @@ __getattr__, __dir__, __all__ = room(
     roughness="amplitude",
     splits="Split Splits",
     threshold="CHIP",
-    tree="Partition ranked",
+    tree="Partition",
 )

@@ -164,7 +164,8 @@ class Partition:
         Args:
             region: Its number.
             points: Its points that are of a piece, at rest [m], [P, 3].
-            piece: Which one, int64 [P]; 0 the largest, and so on (:func:`ranked`).
+            piece: Which one, int64 [P]; 0 the largest, and so on
+                (:func:`~gsfluent.pipeline.matter.fragments.ranked`).
             ids: Regions by piece, the first one ``region`` itself.
             dust: The piece that is dust, single points; -1 for none.
 
@@ -261,27 +262,3 @@ class Partition:
         a, b, c = low.tolist()
         x, y, z = (high - low).tolist()
         return (a, b, c), (x, y, z)
-
-
-def ranked(unit: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Pieces of some points by size, then by place, whatever the order of the points.
-
-    Args:
-        unit: What each hangs together with, int64 [P].
-        rest: Where they are at rest [m], [P, 3].
-
-    Returns:
-        The values of ``unit`` in that order, int64 [F], and the rank of each point's, int64 [P].
-    """
-    ids, index = torch.unique(unit, return_inverse=True)
-    keys = []
-    for axis in (2, 1, 0):
-        low = torch.full((len(ids),), torch.inf, dtype=torch.float64, device=unit.device)
-        keys.append(low.scatter_reduce(0, index, rest[:, axis].double(), "amin"))
-    keys.append(-torch.bincount(index, minlength=len(ids)).double())
-    order = torch.arange(len(ids), device=unit.device)
-    for key in keys:  # the last counts most
-        order = order[torch.argsort(key[order], stable=True)]
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(ids), device=unit.device)
-    return ids[order], rank[index]
