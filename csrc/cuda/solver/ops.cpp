@@ -42,7 +42,9 @@ class Round {
   void capture(const SolverView<T>& s, int law_set, int64_t steps) {
     if (exec_ != nullptr) check_cuda("solver_run", cudaGraphExecDestroy(exec_));
     exec_ = nullptr;
-    check_cuda("solver_run", cudaStreamBeginCapture(stream_, cudaStreamCaptureModeThreadLocal));
+    // Only launches are captured. Relaxed: a kernel's first launch loads it, which may allocate,
+    // and other threads go on meanwhile.
+    check_cuda("solver_run", cudaStreamBeginCapture(stream_, cudaStreamCaptureModeRelaxed));
     cudaError_t error = cuda::solver_build(s, stream_);
     for (int64_t i = 0; i < steps && error == cudaSuccess; ++i)
       error = cuda::solver_step(s, law_set, stream_);
