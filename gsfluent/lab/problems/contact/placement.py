@@ -39,7 +39,7 @@ def brittle_impact(
         shifted: Whether all is shifted by part of a cell.
         turned: Whether all is turned, lattice and motion.
         boost: Speed of the observer [P-wave speed].
-        cfl: Courant number.
+        cfl: Courant number, at most 0.5. Below, points keep what shorter steps would lose.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -56,7 +56,7 @@ def brittle_impact(
     ahead = turn[:, 0]
     world = bodies(
         parts, [SPEED * ahead + frame, -SPEED * ahead + frame], law=NACC, alpha=alpha, cfl=cfl,
-        params=parameters(YOUNG, 0.2, 1.0, c2=1.85, c3=0.3, c4=10.0, c5=0.05),
+        flip=1.0 - 2.0 * cfl, params=parameters(YOUNG, 0.2, 1.0, c2=1.85, c3=0.3, c4=10.0, c5=0.05),
         dtype=torch.float64,
     )  # fmt: skip
     mass = world.scene.mass.cpu()
