@@ -389,19 +389,22 @@ def _moved(web: Web, unit: Tensor, position: Tensor, label: Tensor, places: Tens
     spacing = web.spacing[web.body[points]].double()
     scale = spacing[ends - count]  # of one body, of one spacing
 
-    def total(values: Tensor) -> Tensor:
-        """Sums by piece of values [P, K] that are whole numbers when they are finer, int64."""
-        whole = (values * (_FINE / spacing)[:, None]).round().long()
-        sums = torch.cumsum(whole, 0)[ends - 1]
-        return torch.diff(sums, dim=0, prepend=torch.zeros_like(sums[:1]))
+    last = (torch.arange(9, device=points.device)[:, None] * len(points) + ends - 1).flatten()
+
+    def total(values: list[Tensor]) -> Tensor:
+        """Sums by piece of values [P] that are whole numbers when they are finer, int64 [S, K]."""
+        whole = (torch.stack(values) * (_FINE / spacing)).round().long().flatten()
+        # one running sum of one row: of several a GPU makes slow ones
+        sums = torch.cumsum(whole, 0)[last[: len(values) * len(names)]]
+        sums = torch.diff(sums, prepend=torch.zeros_like(sums[:1]))
+        return sums.view(len(values), -1).T
 
     arms, middles = [], []
     for x in (web.rest[points].double(), position[points].double()):
-        middle = total(x).double() / count[:, None] * (scale / _FINE)[:, None]
+        middle = total(list(x.unbind(dim=1))).double() / count[:, None] * (scale / _FINE)[:, None]
         middles.append(middle)
-        arms.append(x - middle[slot])
-    products = [arms[1][:, i] * arms[0][:, j] / spacing for i in range(3) for j in range(3)]
-    square = total(torch.stack(products, dim=1))
+        arms.append((x - middle[slot]).unbind(dim=1))
+    square = total([arms[1][i] * arms[0][j] / spacing for i in range(3) for j in range(3)])
     u, _, vh = torch.linalg.svd(square.cpu().double().reshape(-1, 3, 3))
     turn = torch.ones(len(names), 1, 3, dtype=torch.float64)
     turn[:, 0, 2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))
