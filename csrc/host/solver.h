@@ -60,6 +60,7 @@ enum SolverBuffer : int {
   kContactRadius,
   kViscous,
   kObject,
+  kOwn,
   kSolverBuffers
 };
 
@@ -73,6 +74,7 @@ enum SolverFloat : int {
   kGap,
   kPower,
   kEpsilon,
+  kFlip,
   kSolverFloats
 };
 enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kSolverInts };
@@ -160,6 +162,7 @@ struct SolverOps {
         {"radius", n, 1, real, true},
         {"viscous", n, kViscousColumns, real, true},
         {"object", ints[kFields], 1, i32, true},
+        {"own", n, 9, real, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -240,6 +243,8 @@ struct SolverOps {
     s.radius = real_at(kContactRadius);
     s.viscous = real_at(kViscous);
     s.object = int_at(kObject);
+    s.own = real_at(kOwn);
+    s.flip = static_cast<T>(floats[kFlip]);
     return s;
   }
 

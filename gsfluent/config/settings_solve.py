@@ -85,7 +85,11 @@ class SolveSettings:
         "1000000",
     )
     cfl: float = key(
-        number(0.05, 0.9), "Courant number of the automatic time step.", "0.7", default=0.5
+        number(0.05, 0.9),
+        "Courant number of the automatic time step. Below 0.5 a CPU keeps what shorter steps would "
+        "lose; a GPU loses it.",
+        "0.7",
+        default=0.5,
     )
     error: float | None = optional(
         _ERROR,

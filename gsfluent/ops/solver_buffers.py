@@ -90,6 +90,7 @@ class Buffers:
     radius: Tensor
     viscous: Tensor
     object: Tensor
+    own: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""

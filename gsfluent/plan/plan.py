@@ -347,6 +347,22 @@ def _unbroken(rows: list[dict[str, Any]]) -> list[str]:
     return found
 
 
+def insulated(shot: Shot) -> list[str]:
+    """Heat that somebody may wait for in vain: it passes neither between objects nor colliders."""
+    warm = {
+        name: settings.temperature
+        for name, settings in shot.objects.items()
+        if settings.temperature is not None
+    }
+    if not warm or (len(shot.objects) == 1 and not shot.colliders):
+        return []
+    said = ", ".join(f"{name} ({degrees:g} C)" for name, degrees in warm.items())
+    return [
+        f"no heat passes between objects, or between them and colliders: {said}; hint: heat.air, "
+        "heat.transfer and heat.floor give and take it"
+    ]
+
+
 def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -> list[str]:
     """What a user should mend before an hour is spent."""
     shot, scene = prospect.shot, prospect.scene
@@ -362,6 +378,7 @@ def _warnings(prospect: Prospect, outlook: Outlook, dx: float, particles: int) -
         found.append(
             "the shot has no events: the object will only rest on the floor; hint: add an event"
         )
+    found += insulated(shot)
     if particles > MAX_PARTICLES:
         found.append(
             f"{particles} material points, more than the {MAX_PARTICLES} that a run takes; hint: "

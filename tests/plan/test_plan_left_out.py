@@ -15,6 +15,7 @@ from gsfluent.config import Shot
 from gsfluent.io.splats.load import save_splats
 from gsfluent.pipeline.simulate.stage import Simulate, Simulation
 from gsfluent.plan.motion import foresee
+from gsfluent.plan.plan import insulated
 from gsfluent.plan.work import passes_of
 from gsfluent.scene.scene import Scene
 
@@ -124,3 +125,26 @@ def test_every_pass_has_a_reason(shot: Shot, tmp_path: Path) -> None:
     rows = passes_of(shot, ball(APPLE, 0.1, 5.0), foresee(ball(APPLE, 0.1, 5.0), DX, 0.2, 4, [9]))
     assert len({row["pass"] for row in rows}) == len(rows)
     assert {row["pass"] for row in rows if not row["needed"]} >= {"blades", "export", "reconstruct"}
+
+
+WARM = {"select": "all", "material": "ice", "temperature": -5.0}
+POT = {"select": {"sphere": [0, 0, 0, 0.1]}, "material": "wood"}
+WAX = {**POT, "material": "wax", "temperature": 20.0}
+PLATE = {"type": "plane", "at": [0, 0, -1], "normal": [0, 0, 1]}
+
+
+@pytest.mark.parametrize(("objects", "colliders", "said"), [
+    ({"ice": WARM}, [], False),
+    ({"ice": WARM, "pot": POT}, [], True),
+    ({"ice": WARM, "wax": WAX}, [], True),
+    ({"ice": WARM}, [PLATE], True),
+    ({"pot": {"select": "all", "material": "wood"}}, [PLATE], False),
+])  # fmt: skip
+def test_heat_that_does_not_pass_is_said(
+    shot: Shot, objects: dict[str, Any], colliders: list[dict[str, Any]], said: bool
+) -> None:
+    given = {"splats": str(shot.splats), "objects": objects, "colliders": colliders}
+    found = insulated(Shot.from_dict(given))
+    assert bool(found) == said
+    if said:
+        assert "ice (-5 C)" in found[0] and "heat.floor" in found[0]

@@ -162,6 +162,35 @@ GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, c
   for (int i = 0; i < 9; ++i) out[i] = row[kMassColumn] * c.m[i] - scale * t.m[i];
 }
 
+// Affine velocity beside a velocity `given` to a particle that moves by `value`: what moves by one
+// velocity and has another would change its angular momentum by dt value x given.
+template <typename T>
+Mat3<T> spin_beside(const T* value, const T* given, T dt, T inv_dx) {
+  const T scale = T(-2) * dt * inv_dx * inv_dx;
+  Mat3<T> spin{};
+  for (int i = 0; i < 3; ++i) {
+    const int j = (i + 1) % 3, k = (i + 2) % 3;
+    spin(k, j) = scale * (value[j] * given[k] - value[k] * given[j]);
+    spin(j, k) = T(0) - spin(k, j);
+  }
+  return spin;
+}
+
+// What the transfer took of a particle's own motion is given back: s.velocity and s.own hold that
+// share of it (cpu/mpm/flip.h), and get what the particle has in the end. CPU only.
+template <typename T>
+void keep_own(const SolverView<T>& s, int64_t p, const Mat3<T>& c, T mass, const T* value, T dt,
+              T* slope) {
+  const Mat3<T> spin = spin_beside(value, s.velocity + 3 * p, dt, s.inv_dx);
+  for (int i = 0; i < 9; ++i) {
+    const T given = s.own[9 * p + i] + mass * spin.m[i];
+    slope[i] += given;
+    s.own[9 * p + i] = mass * c.m[i] + given;
+    s.slope[9 * p + i] = slope[i];
+  }
+  for (int i = 0; i < 3; ++i) s.velocity[3 * p + i] += value[i];
+}
+
 // Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
 // window. False when it left the window; a step that is not finite leaves o where it was.
 template <typename T>
@@ -276,7 +305,8 @@ GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
 // `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
-template <typename T, int kLaws, bool kTrack>
+// kKeeps: with keep_own.
+template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
                                           const ParticleBefore<T>& before, uint32_t reach,
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
@@ -351,7 +381,10 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   }
   T slope[9];
   store_slope(slope, c, stress, r, dt_next);
-  store_motion(s, p, value, slope);
+  if constexpr (kKeeps)
+    keep_own(s, p, c, r[kMassColumn], value, dt, slope);
+  else
+    store_motion(s, p, value, slope);
 
   const T speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
   largest.speed2 = larger(float(speed2), largest.speed2);
@@ -366,13 +399,13 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
 }
 
 // The same with everything read here.
-template <typename T, int kLaws, bool kTrack>
+template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
                                           Largest& largest) {
-  return finish_particle<T, kLaws, kTrack>(s, p, particle_before<T, kLaws>(s, p), reach, value,
-                                           first, dt, dt_next, measures_waves(*s.clock, kLaws),
-                                           T(s.clock->slack), largest);
+  return finish_particle<T, kLaws, kTrack, kKeeps>(
+      s, p, particle_before<T, kLaws>(s, p), reach, value, first, dt, dt_next,
+      measures_waves(*s.clock, kLaws), T(s.clock->slack), largest);
 }
 
 // Start of a call: the slope holds m C (the last step of the call before wrote it with dt_next =

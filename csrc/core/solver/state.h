@@ -203,6 +203,10 @@ struct SolverView {
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes; CPU only
   const int32_t* object;
+  // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the share of their
+  // own motion that points keep in a step (cpu/mpm/flip.h); or null and 0; CPU only
+  T* own;
+  T flip;
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {

@@ -194,7 +194,7 @@ class Builder {
       return meta_row(s_.meta[a]) < meta_row(s_.meta[b]);
     if (differ(s_.velocity, 3, less) || differ(s_.slope, 9, less) || differ(s_.strain, 6, less) ||
         differ(s_.alpha, 1, less) || differ(s_.peak, 1, less) || differ(s_.deformation, 9, less) ||
-        differ(s_.viscous, kViscousColumns, less))
+        differ(s_.viscous, kViscousColumns, less) || differ(s_.own, 9, less))
       return less;
     return false;
   }
@@ -240,6 +240,7 @@ class Builder {
     move(s_.peak, 1);
     move(s_.deformation, 9);
     move(s_.viscous, kViscousColumns);
+    move(s_.own, 9);
     move(s_.id, 1);
   }
 

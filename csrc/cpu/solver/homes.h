@@ -77,9 +77,10 @@ class HomePass {
     return laws == kBrittle ? from_nodes<kBrittle>() : from_nodes<kAnyLaw>();
   }
 
-  template <int kLaws>
+  template <int kLaws, bool kKeeps = false>
   Counts from_nodes() const {
-    return s_.deformation != nullptr ? from_nodes<kLaws, true>() : from_nodes<kLaws, false>();
+    return s_.deformation != nullptr ? from_nodes<kLaws, true, kKeeps>()
+                                     : from_nodes<kLaws, false, kKeeps>();
   }
 
  private:
@@ -206,7 +207,7 @@ class HomePass {
     });
   }
 
-  template <int kLaws, bool kTrack>
+  template <int kLaws, bool kTrack, bool kKeeps>
   void home_from_nodes(int64_t h, T dt, T dt_next, Counts& counts) const {
     const Range r = range(h);
     if (r.begin == r.end) return;
@@ -224,8 +225,8 @@ class HomePass {
         const Packet<T> packet(s_, s_.entry + first, r.end - first);
         Pack<T> offset[3];
         const PacketGathered<T> gathered = chunk.gathered(first - at, offset);
-        finish_packet<T, kLaws, kTrack>(s_, packet, reach, offset, gathered, dt, dt_next, largest,
-                                        counts);
+        finish_packet<T, kLaws, kTrack, kKeeps>(s_, packet, reach, offset, gathered, dt, dt_next,
+                                                largest, counts);
       }
     }
     largest.give(counts.largest);
@@ -267,18 +268,20 @@ class HomePass {
     }
   };
 
-  template <int kLaws, bool kTrack>
+  template <int kLaws, bool kTrack, bool kKeeps>
   Counts from_nodes() const {
     const SolverClock& c = *s_.clock;
     const T dt = static_cast<T>(c.dt), dt_next = static_cast<T>(c.dt_next);
     return parallel_counts(c.homes, kHomeGrain, [&](int64_t begin, int64_t end, Counts& counts) {
-      for (int64_t h = begin; h < end; ++h) home_from_nodes<kLaws, kTrack>(h, dt, dt_next, counts);
+      for (int64_t h = begin; h < end; ++h)
+        home_from_nodes<kLaws, kTrack, kKeeps>(h, dt, dt_next, counts);
     });
   }
 
   // In solver_more.cpp, so that the loops here stay as they are compiled.
   Counts from_nodes_more() const;
   Counts from_nodes_viscous(int laws) const;  // in solver_viscous.cpp
+  friend class FlipPass<T>;                   // in cpu/mpm/flip.cpp, likewise
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;

@@ -1,6 +1,7 @@
 // The resident solver on the CPU: priming and the loop over steps. See cpu/solver/solver.h.
 #include "host/solver.h"
 
+#include "cpu/mpm/flip.h"
 #include "cpu/solver/homes.h"
 #include "cpu/solver/nodes.h"
 
@@ -29,6 +30,7 @@ class Stepper {
         homes_(s, contact_, surface_, touch_),
         nodes_(s, contact_, surface_, touch_) {
     if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
+    if (s.own != nullptr) flip_ = std::make_unique<FlipPass<T>>(s);
   }
 
   // Everything that follows from the blocks; again after each build.
@@ -44,13 +46,17 @@ class Stepper {
     homes_.plan();
     nodes_.plan();
     if (fields_) fields_->plan();
+    if (flip_) flip_->plan();
   }
 
   void step() {
     SolverClock& c = *s_.clock;
     Counts all = homes_.to_nodes(touched_);
     nodes_.run(static_cast<T>(c.dt), touched_);
-    all.add(fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_));
+    if (flip_)
+      all.add(flip_->from_nodes(homes_, laws_));
+    else
+      all.add(fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_));
     c.plastic += all.plastic;
     c.guarded += all.guarded;
     c.inverted += all.inverted;
@@ -70,6 +76,7 @@ class Stepper {
   HomePass<T> homes_;
   NodePass<T> nodes_;
   std::unique_ptr<FieldPass<T>> fields_;
+  std::unique_ptr<FlipPass<T>> flip_;
   std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
 };
 
@@ -105,6 +112,7 @@ struct Cpu {
     prime_particles(s, laws, true);
     start_clock(c, double(s.dx));
     if (c.done != 0 || c.reason != kFine) return;
+    if (s.own != nullptr) std::copy_n(s.slope, 9 * s.count, s.own);  // m C, still without stress
     prime_particles(s, laws, false);
     choose_unit(c);
   }

@@ -32,6 +32,8 @@ template <typename T>
 class HomePass;
 template <typename T>
 class DamagePass;
+template <typename T>
+class FlipPass;
 struct Counts;
 
 // Phase-field matter (solver_fields.cpp, a file of its own: what gcc inlines elsewhere stays as it

@@ -41,7 +41,7 @@ typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<
 }
 
 // finish_particle for every active lane.
-template <typename T, int kLaws, bool kTrack, typename Count>
+template <typename T, int kLaws, bool kTrack, bool kKeeps, typename Count>
 void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t reach,
                    const Pack<T>* offset, const PacketGathered<T>& gathered, T dt, T dt_next,
                    PacketLargest<T>& largest, Count& counts) {
@@ -223,7 +223,22 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   if (done != 0) {
     counts.leaves = counts.leaves || (mask_bits(leaves) & done) != 0;
     packet.store3(rest, s.offset, done);
-    packet.store3(value, s.velocity, done);
+    if constexpr (kKeeps) {  // keep_own
+      P velocity[3], own[9];
+      packet.load3(s.velocity, velocity);
+      packet.load9(s.own, own);
+      const Mat3<P> spin = spin_beside(value, velocity, P(dt), P(inv_dx));
+      for (int i = 0; i < 9; ++i) {
+        own[i] += row[kMassColumn] * spin.m[i];
+        slope[i] += own[i];
+        own[i] += row[kMassColumn] * c.m[i];
+      }
+      for (int i = 0; i < 3; ++i) velocity[i] += value[i];
+      packet.store3(velocity, s.velocity, done);
+      packet.store9(own, s.own, done);
+    } else {
+      packet.store3(value, s.velocity, done);
+    }
     packet.store6(e, s.strain, done);
     packet.store9(slope, s.slope, done);
     for (uint32_t left = done; left != 0; left &= left - 1) {
@@ -264,8 +279,8 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     Mat3<T> moment;
     for (int i = 0; i < 3; ++i) one[i] = value[i][lane];
     for (int i = 0; i < 9; ++i) moment.m[i] = first.m[i][lane];
-    counts.add(finish_particle<T, kLaws, kTrack>(s, packet.index[lane], reach, one, moment, dt,
-                                                 dt_next, counts.largest));
+    counts.add(finish_particle<T, kLaws, kTrack, kKeeps>(s, packet.index[lane], reach, one, moment,
+                                                         dt, dt_next, counts.largest));
   }
 }
 

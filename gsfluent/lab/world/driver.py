@@ -83,6 +83,7 @@ class World:
         viscous: Viscosity of each point, [N, 9], or [9] for all: :func:`gsfluent.ops.viscous_step`.
         touch: With ``surface``, points of different bodies push each other
             (docs/theory/contact.md); else bodies touch at nodes. The solver only.
+        flip: Share of their own motion that points keep in a step (:class:`gsfluent.ops.Solver`).
         **return_map: ``k``, ``epsilon``, ``implicit`` of :func:`gsfluent.ops.return_mapping`.
 
     Raises:
@@ -133,6 +134,7 @@ class World:
         surface: float | None = None,
         viscous: Tensor | None = None,
         touch: bool = False,
+        flip: float = 0.0,
         **return_map: Any,
     ):
         if dt is not None and not 0.0 < dt < math.inf:
@@ -186,6 +188,7 @@ class World:
             frame=None if frame is None else (frame[0], frame[1], frame[2]),
             viscous=None if viscous is None else number(viscous, count, 9),
             objects=None if body is None or not touch else each_its_own(body),
+            flip=flip,
             radius=None if surface is None else surface * number(volume, count) ** (1.0 / 3.0),
         )
         one = torch.eye(3, dtype=dtype, device=device).expand(count, 3, 3).contiguous()

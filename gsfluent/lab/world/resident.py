@@ -54,7 +54,7 @@ class Resident:
             colliders=scene.colliders, friction=scene.friction, restitution=scene.restitution,
             contact_gap=scene.contact_gap, cfl=scene.cfl, dt=scene.fixed_dt,
             irreversible=scene.irreversible, frame=scene.frame, radius=scene.radius,
-            viscous=scene.viscous, objects=scene.objects, **scene.return_map,
+            viscous=scene.viscous, objects=scene.objects, flip=scene.flip, **scene.return_map,
         )  # fmt: skip
         rows = 0 if scene.colliders is None else scene.colliders.shape[0]
         self._none = torch.zeros(rows, 3, dtype=torch.float64, device=velocity.device)

@@ -10,7 +10,7 @@ receive on a torus.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -55,6 +55,7 @@ class Scene:
     radius: Tensor | None = None
     viscous: Tensor | None = None  # viscosity of each point, [N, 9]; ops.viscous_step
     objects: Tensor | None = None
+    flip: float = 0.0
 
 
 def wave_speed(strain: Tensor, law: Tensor, params: Tensor) -> Tensor:
@@ -246,6 +247,7 @@ class Stepper:
         if push is not None:
             grid_velocity, given = push.rub(grid_velocity, grid[..., 3])
             impulse = impulse + given
+        own = self._own(place, take, blocks, body)
         deformation = None if self.deformation is None else take(self.deformation)
         x, v, c, f, skipped = ops.g2p(
             grid_velocity, place, dx=scene.dx, dt=dt, blocks=blocks, body=body,
@@ -255,16 +257,41 @@ class Stepper:
             raise FloatingPointError(
                 f"{int(skipped)} points are not finite or left the grid after {self.steps} steps"
             )
-        self.position, self.velocity, self.affine = x[:count], v[:count], c[:count]
+        self.position = x[:count]
+        increment = dt * c[:count]
+        if own is not None:
+            # what moves by v and has another velocity would change its angular momentum
+            spin = (-2.0 * dt / scene.dx**2) * torch.linalg.cross(v, own[0])
+            turn = torch.linalg.cross(spin[:, :, None], torch.eye(3).to(spin)[None], dim=1)
+            v, c = v + own[0], c + own[1] + turn
+        self.velocity, self.affine = v[:count], c[:count]
         self.deformation = None if f is None else f[:count]
-        *returned, info = self._map(dt * self.affine, dt)
-        after = self._thickened((returned[0], returned[1], returned[2]), dt * self.affine, dt)
+        *returned, info = self._map(increment, dt)
+        after = self._thickened((returned[0], returned[1], returned[2]), increment, dt)
         self.viscous, self.strain, self.alpha, self.stress = after
         self.info += info
         self.peak = self.cracks.grown(self.peak, self.alpha)
         self.impulse += impulse
         self.time += dt
         self.steps += 1
+
+    def _own(
+        self, place: Tensor, take: Callable[[Tensor], Tensor], blocks: ops.Blocks,
+        body: Tensor | None,
+    ) -> tuple[Tensor, Tensor] | None:  # fmt: skip
+        """Velocity and affine matrix that points keep of what the transfer alone would take."""
+        scene = self.scene
+        if scene.flip == 0.0:
+            return None
+        velocity, affine = take(self.velocity), take(self.affine)
+        free, _ = ops.p2g(
+            place, velocity, affine, take(scene.mass), dx=scene.dx, blocks=blocks, body=body,
+            fields=scene.fields,
+        )  # fmt: skip
+        momentum, mass = free[..., :3], free[..., 3:]
+        nodes = torch.where(mass > 1e-30, momentum / mass.clamp(min=1e-30), 0.0)
+        _, v, c, _ = ops.g2p(nodes, place, dx=scene.dx, dt=0.0, blocks=blocks, body=body)
+        return scene.flip * (velocity - v), scene.flip * (affine - c)
 
     def _pushed(
         self, grid: Tensor, blocks: ops.Blocks, dt: float, body: Tensor | None

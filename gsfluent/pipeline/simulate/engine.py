@@ -83,7 +83,9 @@ class SolverOptions:
     """How the matter is moved: what stage, stepper and engine all read.
 
     Args:
-        cfl: Courant number of the automatic time step, in (0, 1].
+        cfl: Courant number of the automatic time step, in (0, 1]. Below 0.5 points keep part of
+            their own motion (FLIP), so that shorter steps lose no more in the same time; the
+            resident solver on a CPU only, and not beside phase-field matter.
         free_flight: Move bodies that touch nothing in closed form instead of on the grid.
         piece_flight: Do so again with bodies and pieces that touch nothing any more.
         sleep: Take off the grid what rests, until something comes near.
@@ -125,6 +127,11 @@ class SolverOptions:
     surface: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
+
+    @property
+    def flip(self) -> float:
+        """Share of their own motion that points keep where the solver can (docs/theory/mpm.md)."""
+        return max(0.0, 1.0 - self.cfl / CFL)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cfl <= 1.0:

@@ -191,6 +191,8 @@ class Resident:
             material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
             cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
         )  # fmt: skip
+        if p.velocity.device.type == "cpu" and not matter.has_field:
+            constants["flip"] = options.flip
         if options.surface:
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(

@@ -9,7 +9,7 @@ import pytest
 import torch
 from simulation_shapes import ellipsoid
 
-from gsfluent import materials
+from gsfluent import materials, ops
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.pipeline.simulate.engine import SolverOptions
@@ -256,6 +256,21 @@ def test_options_are_given_by_name_or_as_one_record():
     options = SolverOptions(cfl=0.3, sleep=False)
     assert Simulate(cfl=0.3, sleep=False).options == options == Simulate(options=options).options
     assert Simulate(options=options, cfl=0.4).options == SolverOptions(cfl=0.4, sleep=False)
+
+
+@pytest.mark.parametrize(("cfl", "share"), [(0.5, 0.0), (0.8, 0.0), (0.25, 0.5)])
+def test_the_solver_keeps_what_shorter_steps_would_lose(monkeypatch, cfl, share):
+    made, solver = [], ops.Solver
+
+    def watched(*given, **options):
+        made.append(solver(*given, **options))
+        return made[-1]
+
+    monkeypatch.setattr(ops, "Solver", watched)
+    options = SolverOptions(cfl=cfl, free_flight=False, piece_flight=False, sleep=False)
+    for _ in Simulate(dx=0.025, options=options)(ball_scene(), fps=200, seconds=0.01):
+        pass
+    assert made and all(s.flip == pytest.approx(share) for s in made)
 
 
 def test_options_are_taken_under_their_old_names(caplog):
