@@ -25,6 +25,8 @@ from gsfluent.pipeline.light.lamps import (
 )
 from gsfluent.results.frames import DUST, SavedFrame
 
+DROPS = (0.25, 16.0)
+"""k_s and n_s of drops of juice, whose splats have one normal each and no dome."""
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
 
@@ -122,7 +124,8 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
 
     None for frames that do not say which body is what (written by an older gsfluent). Splats of
-    rigid things are steel, and the dust of what is wet shines like water.
+    rigid things are steel, and the dust of what is wet are drops: round, so that a highlight takes
+    a small part of each (:data:`DROPS`).
     """
     names = frame.facts.get("bodies")
     if not names:
@@ -135,8 +138,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
             row = (made_of.specular, made_of.shininess)
         rows.append(row)
         wet.append(materials.wet(preset))
-    for name in ("steel", "water"):
-        rows.append((materials.get(name).specular, materials.get(name).shininess))
+    rows += [(materials.get("steel").specular, materials.get("steel").shininess), DROPS]
     table = torch.tensor(rows).to(frame.gaussians.means)
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
@@ -145,6 +147,14 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         juice = torch.tensor([*wet, False], device=anchor.device)[looks_like]
         looks_like = torch.where((frame.ids >= DUST) & juice, len(wet) + 1, looks_like)
     return table[looks_like]
+
+
+def plates_of(frame: SavedFrame) -> Tensor:
+    """Splats whose shortest axis is their normal, bool [N]: those of rigid things, and of dust.
+
+    Grains are left out of the density that other normals come from.
+    """
+    return (frame.anchor < 0) | (frame.ids >= DUST)
 
 
 def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
