@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from gsfluent.pipeline.light.lamps import (
     Lighting,
     studio_light,
 )
+from gsfluent.pipeline.liquid.clear import Clear
 from gsfluent.results.frames import DUST, SavedFrame
 
 DROPS = (0.25, 16.0)
@@ -171,6 +173,33 @@ def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     body = frame.body[anchor.clamp(min=0)].long()
     solid = (anchor >= 0) & (frame.ids < DUST)
     return table[torch.where(solid, body, len(clear))]
+
+
+def clear_of(frame: SavedFrame) -> Clear | None:
+    """The splats of clear liquids; None where there are none.
+
+    A liquid lets through as much of the light on every centimetre as its ``transmission`` says.
+    """
+    found = []
+    for _, preset in frame.facts.get("bodies", ()):
+        made = materials.get(preset) if preset in materials.names() else None
+        flows = made is not None and made.law == "fluid" and made.transmission > 0.0
+        found.append(-math.log(made.transmission) / 0.01 if made is not None and flows else 0.0)
+    if not any(found):
+        return None
+    like = frame.gaussians.means
+    anchor = frame.anchor.long()
+    body = frame.body[anchor.clamp(min=0)].long()
+    each = like.new_tensor(found)[body]
+    # those of solids have numbers up from 0, those of the repair too
+    rows = (anchor >= 0) & (frame.ids < 0) & (each > 0.0)
+    gloss = [materials.get(p) for (_, p), a in zip(frame.facts["bodies"], found, strict=True) if a]
+    return Clear(
+        rows=rows,
+        volume=frame.volumes[anchor[rows]],
+        attenuation=each[rows],
+        gloss=like.new_tensor([gloss[0].specular, gloss[0].shininess]),
+    )
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:
