@@ -36,7 +36,7 @@ from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import body_frame
-from gsfluent.pipeline.partition.roughness import amplitude
+from gsfluent.pipeline.partition.roughness import amplitude, relief
 from gsfluent.pipeline.partition.threshold import CHIP as PIECE
 from gsfluent.pipeline.partition.tree import Partition, ranked
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
@@ -293,10 +293,10 @@ class Chunks:
         owner[wrong] = self._nearest(means[wrong], here[wrong], rows)
         self._owner = self._owner.index_copy(0, splats, owner)
         self._burn(splats[here == ash], thrown)
-        made = find_faces(partition, split, solid, len(self._events) - 1)
+        high = relief(self._scene.bodies[body].material.name)
+        made = find_faces(partition, split, solid, len(self._events) - 1, high)
         made = made.select(made.region != ash)
-        spacing = matter.spacing[body]
-        cuts = wide_cuts(self.base.gaussians, splats, here, cuts, made, spacing)
+        cuts = wide_cuts(self.base.gaussians, splats, here, cuts, made, matter.spacing[body])
         cuts = ChunkCuts(*(part[self._region[cuts.splat] != ash] for part in cuts))
         means = self.base.gaussians.means[cuts.splat]
         self._cuts.append(cuts._replace(rival=self._across(means, cuts.beyond, rows, ash, thrown)))
