@@ -131,3 +131,19 @@ def test_schlick_and_what_stands_before() -> None:
     assert in_front(surface, torch.ones(1, 3), depth, H)[0].tolist() == pytest.approx(
         [0.0, 0.5, 1.0]
     )
+
+
+@pytest.mark.cuda
+def test_the_same_water_on_a_gpu() -> None:
+    _, water = pool(0.012)
+    whole = Gaussians.cat([water, stone(0.03)])
+    found = []
+    for device in ("cpu", "cuda"):
+        rows = (torch.arange(whole.count) < water.count).to(device)
+        volume = torch.full((water.count,), H**3, device=device)
+        told = Clear(rows, volume, torch.full_like(volume, LETS), volume.new_tensor([0.9, 200.0]))
+        stage = Render(camera(), studio_light())
+        made = stage(whole.to(device), clear=told)
+        found.append((made.image.cpu(), made.alpha.cpu()))
+    for one, other in zip(*found, strict=True):
+        assert float((one - other).abs().mean()) < 1e-3
