@@ -146,7 +146,8 @@ class Material:
         dust: How much of a break is dust, 0 to 1; sets the most mass that may come loose.
         specular: Strength of its highlights, k_s of Blinn-Phong.
         shininess: Narrowness of its highlights, n_s of Blinn-Phong.
-        transmission: Share of the light that one face lets through where it is seen face on.
+        transmission: Share of the light that one face lets through where it is seen face on; of a
+            liquid, that a centimetre of it does.
         parts: Default parts (for :meth:`gsfluent.Scene.add`), e.g. the rind of a melon.
         sources: Field name -> where the number is from. A field that is not named was chosen by
             eye.

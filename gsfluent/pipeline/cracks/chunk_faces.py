@@ -27,6 +27,8 @@ WIDTH, THICKNESS = 0.75, 0.15
 """Standard deviations of an element along and across its face, in voxels."""
 CRUST = 0.5
 """Depth [voxels of the colours] to which an element wears the colour of the skin."""
+STEEPEST = 1.0
+"""Slope of the walls of pores, at most: where they are steeper one would look past the element."""
 _STEP = 1.5  # voxels that an element may be moved onto its face
 _LEAST = 1e-12
 _NUMBER = 41  # bits of a key below the number of its split
@@ -100,7 +102,11 @@ class ChunkCuts(NamedTuple):
 
 
 def find_faces(
-    partition: Partition, splits: Sequence[Split], solid: Solid, numbers: Sequence[int]
+    partition: Partition,
+    splits: Sequence[Split],
+    solid: Solid,
+    numbers: Sequence[int],
+    relief: float = 0.0,
 ) -> ChunkFaces:
     """Face elements of splits: one in every voxel beside a voxel of another piece.
 
@@ -111,6 +117,7 @@ def find_faces(
         splits: What was done, to regions that none of the others touched; at least one.
         solid: The body's solid, for the colours.
         numbers: Number of each split, which enters the keys.
+        relief: How much higher white matter stands than black [m]: pores are pits.
     """
     edge, seen = partition.voxel, Splits(splits)
     sites = [_beside(partition, split) for split in splits]
@@ -136,9 +143,13 @@ def find_faces(
         "number": number,
     }  # fmt: skip
     spot = center + (reach - INSET * edge)[:, None] * normal
+    toward = normal
+    if relief > 0.0:
+        tilted = _tilted(partition, solid, spot, normal, relief)
+        toward = torch.where(crust[:, None], normal, tilted)
     parts = [
         _elements(
-            spot, normal, edge, torch.where(crust[:, None], skin, matter), 0,
+            spot, toward, edge, torch.where(crust[:, None], skin, matter), 0,
             (outward, below - ((spot - center) * outward).sum(dim=1)), **common,
         )
     ]  # fmt: skip
@@ -183,9 +194,7 @@ def _elements(
     plane: tuple[Tensor, Tensor], *, number: Tensor, voxel: Tensor, region: Tensor, beyond: Tensor,
 ) -> ChunkFaces:  # fmt: skip
     """Flat elements that end at a plane: its unit normal, and how far off it is [m]."""
-    reference = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
-    one = torch.nn.functional.normalize(torch.linalg.cross(normal, reference), dim=1)
-    axes = torch.stack([one, torch.linalg.cross(normal, one), normal], dim=2)
+    axes = torch.stack([*_across(normal), normal], dim=2)
     size = torch.tensor([WIDTH, WIDTH, THICKNESS], device=means.device) * edge
     root = axes * size
     covariance = root @ root.mT
@@ -197,6 +206,31 @@ def _elements(
         means=means, quats=quats, scales=scales, color=color, normals=normal,
         owner=none, rival=none, ash=none,
     )  # fmt: skip
+
+
+def _tilted(
+    partition: Partition, solid: Solid, spot: Tensor, normal: Tensor, relief: float
+) -> Tensor:
+    """Normals [M, 3] of faces on which lightness is height: ``relief`` [m] from black to white."""
+    one, two = _across(normal)
+    slopes = []
+    for axis in (one, two):
+        ends = []
+        for side in (1.0, -1.0):
+            means = partition.own(spot + side * partition.voxel * axis).to(torch.float32)
+            place = (means - solid.origin.to(means)) / solid.voxel
+            ends.append(matter_colors(solid, place, means).mean(dim=1))
+        slopes.append((ends[0] - ends[1]) * (0.5 * relief / partition.voxel))
+    steep = torch.stack(slopes, dim=1)
+    steep = steep * (STEEPEST / steep.norm(dim=1, keepdim=True).clamp(min=1e-6)).clamp(max=1.0)
+    return torch.nn.functional.normalize(normal - steep[:, :1] * one - steep[:, 1:] * two, dim=1)
+
+
+def _across(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors along faces of normals [M, 3]."""
+    reference = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
+    one = torch.nn.functional.normalize(torch.linalg.cross(normal, reference), dim=1)
+    return one, torch.linalg.cross(normal, one)
 
 
 def _outward(partition: Partition, grid: Tensor) -> Tensor:

@@ -38,7 +38,7 @@ from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import body_frame
-from gsfluent.pipeline.partition.roughness import amplitude
+from gsfluent.pipeline.partition.roughness import amplitude, relief
 from gsfluent.pipeline.partition.splits import Split
 from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
@@ -301,7 +301,8 @@ class Chunks:
         owner[wrong] = sides.own(means[wrong], here[wrong])
         self._owner = self._owner.index_copy(0, rows, owner)
         self._burn(rows[sides.ash[here]], sides)
-        made = find_faces(partition, splits, solid, numbers)
+        high = relief(self._scene.bodies[body].material.name)
+        made = find_faces(partition, splits, solid, numbers, high)
         made = made.select(~sides.ash[made.region])
         cuts = wide_cuts(splats, rows, here, cuts, made, matter.spacing[body])
         cuts = ChunkCuts(*(part[~sides.ash[self._region[cuts.splat]]] for part in cuts))

@@ -2,7 +2,7 @@
 
 A point of dust is as large as the grid is fine, which no grain of the real thing is. So it is drawn
 as grains, as frequent as their size to the power -3.5 (Villermaux 2025), in the colours of the
-places that they come from, drops nearer to that of the whole body. Their volumes sum to that of
+places that they come from, drops nearer to that of the flesh. Their volumes sum to that of
 the point. They leave with it: a point that has gone a way relative to the chunk that it came from
 has scattered its grains by a fifth of that. What is left behind is a pit in the chunk
 (:mod:`gsfluent.pipeline.cracks.chunks`). Drops that reach the floor spread on it.
@@ -34,7 +34,9 @@ BETA = 3.5
 """Grains are as frequent as their size to the power of minus this, in solids."""
 FINEST, COARSEST = 1.0 / 8.0, 1.0 / 2.0
 """Smallest and largest grain, in edges of a point."""
-DROP, GRAIN = 3e-3, 1.5e-3
+SPLASH = 1.0
+"""Largest drop, in edges of a point: one size would look like beads."""
+DROP, GRAIN = 1.5e-3, 1.5e-3
 """Smallest drop and grain of powder [m], whatever the grid: juice does not become mist. Where that
 is more than a point, only some of the points have one."""
 SHARE = 1.0 / 40.0
@@ -54,14 +56,17 @@ OPACITY = 0.97
 WET = (1.8, 1.0, 1.0)
 POWDER = (1.0, 0.8, 0.45)
 """Proportions of drops, which are drawn out along their way, and of grains of powder, at most."""
-SPREAD = 2.0
+SPREAD = 3.0
 """How many times wider a drop is that has landed; milk and water spread 2 to 4 times on impact
-(Pasandideh-Fard et al. 1996) and draw back again."""
+(Pasandideh-Fard et al. 1996)."""
+THIN, DEEP = 0.62, 0.75
+"""Opacity and colour of a drop that has landed, over those in flight: so thin a film of juice lets
+the floor through, and a wet floor is darker."""
 LANDED, FALLING = 1.2, 2.4
 """Height of a point above the floor [its edges] at which its grains lie on it, and from which they
 know nothing of it: the grid feels the floor from a cell and a half away."""
 JUICE = 0.85
-"""Share of the body's mean colour in that of a drop: juice is mixed, wherever it came from."""
+"""Share of the mean colour of the flesh in that of a drop: juice is mixed, wherever it is from."""
 STILL = 1e-3
 """A point that has gone less than this since the last frame [edges] lies still."""
 _ASKED = 4096  # points of a body that are asked for its mean colour, about
@@ -116,10 +121,18 @@ class Dust:
     def _juice(self, number: int, color: Callable[[Tensor], Tensor], places: Tensor) -> Tensor:
         """Colours [G, 3] of drops of a body that come from places at rest [m], [G, 3]."""
         if number not in self._mean:
+            self._mean[number] = self._flesh(number, color).to(places)
+        return torch.lerp(color(places), self._mean[number], JUICE)
+
+    def _flesh(self, number: int, color: Callable[[Tensor], Tensor]) -> Tensor:
+        """Mean colour [3] of the deeper half of a body: a rind gives no juice."""
+        solid = self._scene.bodies[number].solid
+        if solid is None or solid.color is None:
             a, b = self._matter.ranges[number]
             step = max(1, (b - a) // _ASKED)
-            self._mean[number] = color(self._matter.rest[a:b:step]).mean(dim=0)
-        return torch.lerp(color(places), self._mean[number], JUICE)
+            return color(self._matter.rest[a:b:step]).mean(dim=0)
+        below = solid.depth[solid.occupancy]
+        return solid.color[solid.occupancy][below >= below.median()].mean(dim=0)
 
     @functools.cached_property
     def _finest(self) -> list[float]:
@@ -131,9 +144,9 @@ class Dust:
         expected = dust_limit(share, points) * points
         found: list[float] = []
         for its, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
-            size = DROP if materials.wet(its.material.name) else GRAIN
-            wanted = size / self._matter.spacing[len(found)]
-            found.append(max(finest(many), min(wanted, SHARE * own ** (1.0 / 3.0))))
+            wet = materials.wet(its.material.name)
+            wanted = (DROP if wet else GRAIN) / self._matter.spacing[len(found)]
+            found.append(max(finest(many, wet), min(wanted, SHARE * own ** (1.0 / 3.0))))
         return found
 
     def step(self, position: Tensor, led: Tensor) -> None:
@@ -234,7 +247,8 @@ class Grains:
         reach = SCATTER * gone.norm(dim=1)
         off = self.offset[some] + reach[:, None] * self.toward[some]
         off = off - LAG * self.lag[some, None] * gone
-        quats, scales = self.quats[some], self.scales[some]
+        quats, scales, color = self.quats[some], self.scales[some], self.color[some]
+        opacity = opacity[some]
         if floor is not None:
             # what lies on the floor is no heap
             height = (here[:, 2] - floor).clamp(min=0.0)
@@ -244,14 +258,16 @@ class Grains:
             lies = lies.clamp(0.0, 1.0)
             wet = (self.wet[some] & (lies > 0.0)).nonzero()[:, 0]
             quats[wet], scales[wet] = _spread(quats[wet], scales[wet], lies[wet])
+            opacity[wet] *= 1.0 - (1.0 - THIN) * lies[wet]
+            color[wet] *= 1.0 - (1.0 - DEEP) * lies[wet, None]
             down = floor + _half_height(quats, scales) - (here + off)[:, 2]
             off[:, 2] += lies * down
         gaussians = Gaussians(
             means=here + off,
             quats=quats,
             scales=scales,
-            opacities=opacity[some],
-            sh=geometry.rgb_to_sh0(self.color[some])[:, None],
+            opacities=opacity,
+            sh=geometry.rgb_to_sh0(color)[:, None],
             labels=torch.full_like(row, SPRAY, dtype=torch.int32),
             normals=geometry.quaternion_to_matrix(quats)[..., 2],
         )
@@ -297,7 +313,7 @@ def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
         least: Smallest grain, in edges.
         wet: Drops, or else powder.
     """
-    many = per_point(least)
+    many = per_point(least, wet)
     if many < 1.0:
         has = 0.5 + 0.5 * hashed((rows * 0x9E3779B1) & 0xFFFFFFFF, 13) < many
         rows, edge = rows[has], edge[has]
@@ -306,7 +322,7 @@ def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
     seed = ((rows[:, None] * 0x9E3779B1) & 0xFFFFFFFF) ^ ((number * 0x85EBCA6B) & 0xFFFFFFFF)
     # one size in each of as many strata, so that every point has some of all
     drawn = 0.5 + 0.5 * hashed(seed, 0)
-    size = quantile((number + drawn) / count, least)
+    size = quantile((number + drawn) / count, least, wet)
     if many >= 1.0:
         size = size * (size.pow(3).sum(dim=1, keepdim=True) * (math.pi / 6.0)).pow(-1.0 / 3.0)
     size = size.reshape(-1)
@@ -315,7 +331,7 @@ def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
     ring = (1.0 - height * height).sqrt()
     toward = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1)
     out = (0.5 + 0.5 * hashed(seed, 3))[:, None] * toward
-    lag = (0.5 + 0.5 * hashed(seed, 12)) * (1.0 - (size / _largest(least)).clamp(max=1.0))
+    lag = (0.5 + 0.5 * hashed(seed, 12)) * (1.0 - (size / _largest(least, wet)).clamp(max=1.0))
     offset = 0.5 * hashes(seed, range(4, 7)) * edge.double().repeat_interleave(count)[:, None]
     draw = (0.5 + 0.5 * hashed(seed, 7))[:, None]
     shape = 1.0 + draw * (draw.new_tensor(WET if wet else POWDER) - 1.0)
@@ -343,26 +359,26 @@ def _along(toward: Tensor) -> Tensor:
     return torch.nn.functional.normalize(half, dim=1)
 
 
-def quantile(share: Tensor, least: float) -> Tensor:
+def quantile(share: Tensor, least: float, wet: bool) -> Tensor:
     """Size below which a share of the grains lies, in edges, by ``n(d) ~ d^-3.5``."""
-    low, high = least ** (1.0 - BETA), _largest(least) ** (1.0 - BETA)
+    low, high = least ** (1.0 - BETA), _largest(least, wet) ** (1.0 - BETA)
     return (low + share * (high - low)).pow(1.0 / (1.0 - BETA))
 
 
-def _largest(least: float) -> float:
+def _largest(least: float, wet: bool) -> float:
     """Largest grain: few grains that have a point's volume are larger."""
-    return max(COARSEST, 1.6 * least)
+    return max(SPLASH if wet else COARSEST, 1.6 * least)
 
 
-def per_point(least: float) -> float:
+def per_point(least: float, wet: bool) -> float:
     """Grains of the law that have the volume of a point: as balls, on average."""
-    low, high = least, _largest(least)
+    low, high = least, _largest(least, wet)
     cubes = (high ** (4.0 - BETA) - low ** (4.0 - BETA)) / (4.0 - BETA)
     many = (low ** (1.0 - BETA) - high ** (1.0 - BETA)) / (BETA - 1.0)
     return min(float(_ROOM), 6.0 / math.pi * many / cubes)
 
 
-def finest(points: float) -> float:
+def finest(points: float, wet: bool) -> float:
     """Smallest grain [edges] with which so many points of dust stay within :data:`MOST`."""
     steps = [FINEST * 4.0 ** (k / 32.0) for k in range(33)]
-    return next((size for size in steps if points * per_point(size) <= MOST), steps[-1])
+    return next((size for size in steps if points * per_point(size, wet) <= MOST), steps[-1])

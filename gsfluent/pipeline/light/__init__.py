@@ -7,11 +7,11 @@ __getattr__, __dir__, __all__ = room(
     albedo="Albedo",
     bake="bake_light",
     environment="sky_and_ground",
-    from_shot="changed gloss_of light_of looks_of transmission_of",
+    from_shot="changed clear_of gloss_of light_of looks_of plates_of transmission_of",
     glass="as_seen",
     lamps="Lamp Lighting SHININESS SOFTNESS SPECULAR pack_lamps",
     normals="Grid grid_for occupancy_cell plate_normals splat_normals",
     occlusion="Occupancy",
-    shade="arriving surface_points to_display to_linear",
+    shade="arriving irradiance surface_points to_display to_linear",
     shadow_maps="Bulk Lit bulk faces_of shadow_maps",
 )

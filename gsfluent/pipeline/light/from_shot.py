@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,11 @@ from gsfluent.pipeline.light.lamps import (
     Lighting,
     studio_light,
 )
+from gsfluent.pipeline.liquid.clear import Clear
 from gsfluent.results.frames import DUST, SavedFrame
 
+DROPS = (0.25, 16.0)
+"""k_s and n_s of drops of juice, whose splats have one normal each and no dome."""
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
 
@@ -122,7 +126,8 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
 
     None for frames that do not say which body is what (written by an older gsfluent). Splats of
-    rigid things are steel, and the dust of what is wet shines like water.
+    rigid things are steel, and the dust of what is wet are drops: round, so that a highlight takes
+    a small part of each (:data:`DROPS`).
     """
     names = frame.facts.get("bodies")
     if not names:
@@ -135,8 +140,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
             row = (made_of.specular, made_of.shininess)
         rows.append(row)
         wet.append(materials.wet(preset))
-    for name in ("steel", "water"):
-        rows.append((materials.get(name).specular, materials.get(name).shininess))
+    rows += [(materials.get("steel").specular, materials.get("steel").shininess), DROPS]
     table = torch.tensor(rows).to(frame.gaussians.means)
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
@@ -145,6 +149,14 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
         juice = torch.tensor([*wet, False], device=anchor.device)[looks_like]
         looks_like = torch.where((frame.ids >= DUST) & juice, len(wet) + 1, looks_like)
     return table[looks_like]
+
+
+def plates_of(frame: SavedFrame) -> Tensor:
+    """Splats whose shortest axis is their normal, bool [N]: those of rigid things, and of dust.
+
+    Grains are left out of the density that other normals come from.
+    """
+    return (frame.anchor < 0) | (frame.ids >= DUST)
 
 
 def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
@@ -161,6 +173,33 @@ def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     body = frame.body[anchor.clamp(min=0)].long()
     solid = (anchor >= 0) & (frame.ids < DUST)
     return table[torch.where(solid, body, len(clear))]
+
+
+def clear_of(frame: SavedFrame) -> Clear | None:
+    """The splats of clear liquids; None where there are none.
+
+    A liquid lets through as much of the light on every centimetre as its ``transmission`` says.
+    """
+    found = []
+    for _, preset in frame.facts.get("bodies", ()):
+        made = materials.get(preset) if preset in materials.names() else None
+        flows = made is not None and made.law == "fluid" and made.transmission > 0.0
+        found.append(-math.log(made.transmission) / 0.01 if made is not None and flows else 0.0)
+    if not any(found):
+        return None
+    like = frame.gaussians.means
+    anchor = frame.anchor.long()
+    body = frame.body[anchor.clamp(min=0)].long()
+    each = like.new_tensor(found)[body]
+    # those of solids have numbers up from 0, those of the repair too
+    rows = (anchor >= 0) & (frame.ids < 0) & (each > 0.0)
+    gloss = [materials.get(p) for (_, p), a in zip(frame.facts["bodies"], found, strict=True) if a]
+    return Clear(
+        rows=rows,
+        volume=frame.volumes[anchor[rows]],
+        attenuation=each[rows],
+        gloss=like.new_tensor([gloss[0].specular, gloss[0].shininess]),
+    )
 
 
 def _environment(settings: EnvironmentSettings) -> environment.Coefficients | None:

@@ -4,6 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
+    clear="OPACITY Clear Surface body_opacities ceiling in_front mirrored smoothed",
     looks="Liquids",
     nozzle="WAITING pours",
     sheet="CLOSED ellipsoids",

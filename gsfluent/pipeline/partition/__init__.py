@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     chips="hashed hashes",
     mesh="PieceMesh Surfaces",
-    roughness="amplitude",
+    roughness="amplitude relief",
     splits="Split Splits",
     threshold="CHIP",
     tree="Partition",

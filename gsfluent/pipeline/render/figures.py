@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -21,6 +22,8 @@ from gsfluent import geometry, ops
 from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.ops.raster import Rendered
+from gsfluent.pipeline.light.from_shot import clear_of
+from gsfluent.pipeline.liquid.clear import OPACITY
 from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.render.flicker import Flow, flicker
 from gsfluent.pipeline.render.holes import Holes, MatterView, small
@@ -136,7 +139,7 @@ class FilmFigures:
             depth: Their expected depth there [m], [H, W].
         """
         index = len(self._values["flicker"])
-        view = small(camera)
+        frame, view = _solid(frame), small(camera)
         places = frame.shown
         matter = MatterView.of(places, frame.volumes, view)
         film = Holes.of(alpha, depth, matter)
@@ -198,6 +201,15 @@ class FilmFigures:
 def _bare(frame: SavedFrame, shown: MatterView, view: Camera) -> MatterView:
     """Matter where it is: with that a splat goes of which nobody takes care."""
     return shown if frame.led is None else MatterView.of(frame.positions, frame.volumes, view)
+
+
+def _solid(frame: SavedFrame) -> SavedFrame:
+    """The frame with its clear liquids opaque: what is seen through water is no hole in it."""
+    clear = clear_of(frame)
+    if clear is None:
+        return frame
+    opaque = torch.where(clear.rows, OPACITY, frame.gaussians.opacities)
+    return replace(frame, gaussians=frame.gaussians.replace(opacities=opaque))
 
 
 def _drawn(gaussians: Gaussians, camera: Camera, groups: Tensor | None) -> Rendered:

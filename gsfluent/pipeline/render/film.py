@@ -18,7 +18,7 @@ from gsfluent.errors import InputError
 from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.light.albedo import Albedo
-from gsfluent.pipeline.light.from_shot import gloss_of, transmission_of
+from gsfluent.pipeline.light.from_shot import clear_of, gloss_of, plates_of, transmission_of
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
@@ -122,10 +122,11 @@ class Film:
             camera,
             groups=frame.groups,
             gloss=gloss,
-            plates=frame.anchor < 0,
+            plates=plates_of(frame),
             backdrop=self.backdrop,
             time=frame.time,
             room=self._room,
+            clear=clear_of(frame),
         )
         if clear is not None:
             # what is seen through glass is no hole in it

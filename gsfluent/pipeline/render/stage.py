@@ -10,7 +10,7 @@ each pixel once. Siblings that repair created are composited nearest-only throug
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -23,7 +23,18 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import Grid, grid_for, plate_normals, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
+from gsfluent.pipeline.light.shade import irradiance, surface_points, to_display, to_linear
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
+from gsfluent.pipeline.liquid.clear import (
+    OPACITY,
+    Clear,
+    Surface,
+    body_opacities,
+    ceiling,
+    in_front,
+    mirrored,
+    smoothed,
+)
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.studio import Studio
 from gsfluent.pipeline.stage import Stage
@@ -124,6 +135,7 @@ class Render(Stage):
         backdrop: Backdrop | None = None,
         time: float = 0.0,
         room: Room | None = None,
+        clear: Clear | None = None,
     ) -> Picture:
         """Render one picture.
 
@@ -139,6 +151,8 @@ class Render(Stage):
             time: Moment [s], for lamps that move.
             room: ``room`` of the picture before in a film, so that the grid behind normals and
                 occlusion stays what it was while the matter fits.
+            clear: The splats that are a clear liquid: drawn as its body and its surface, the same
+                in ``alpha`` as if they were opaque. None draws them as all others.
 
         Raises:
             InputError: No camera, or a camera with lens distortion.
@@ -146,11 +160,21 @@ class Render(Stage):
         camera = self._camera(camera)
         means = gaussians.means
         view = (_moved(camera.viewmat, means), _moved(camera.K, means))
+        eye = -(view[0][:3, 3] @ view[0][:3, :3])
         lighting = None if self.light is None else self.light.at(time)
+        everything = (gaussians, groups)
+        if clear is not None and bool(clear.rows.any()) and not bool(clear.rows.all()):
+            everything = (_as_body(gaussians, clear, eye), groups)
+            rest = (~clear.rows).nonzero()[:, 0]
+            gaussians = gaussians.select(rest)
+            groups, gloss, plates = (
+                None if value is None else value[rest] for value in (groups, gloss, plates)
+            )
+        else:
+            clear = None
         lit, extras = None, None
         if lighting is not None:
-            lit, room = self._light(gaussians, camera, lighting, groups, room)
-            eye = -(view[0][:3, 3] @ view[0][:3, :3])
+            lit, room = self._light(gaussians, camera, lighting, everything, room)
             extras = splat_normals(gaussians, lit.grid, eye)
             if plates is not None:
                 extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
@@ -197,8 +221,12 @@ class Render(Stage):
                 before = (opaque > 0.5) & (away < depth)[..., None] & (cover > 0.0)
                 image = torch.where(before, captured + image * (1.0 - opaque), image)
             image = image.clamp(0.0, 1.0)
+        if clear is not None:
+            image, alpha, depth = _wetted(
+                (image, alpha, depth), everything, clear, camera, view, lit
+            )
         report = {
-            "gaussians": gaussians.count,
+            "gaussians": everything[0].count,
             "lamps": 0 if lit is None else len(lit.lamps),
             "shadow_maps": 0 if lit is None or lit.maps is None else len(lit.maps.depth),
             "grid_cell": None if room is None else room.grid.cell,
@@ -221,11 +249,12 @@ class Render(Stage):
         gaussians: Gaussians,
         camera: Camera,
         lighting: Lighting,
-        groups: Tensor | None,
+        casters: tuple[Gaussians, Tensor | None],
         room: Room | None,
     ) -> tuple[Lit, Room]:
-        """Shadow maps and occupancy of this state of the matter."""
-        matter = bulk(gaussians)
+        """Occupancy of this state of the matter, and shadow maps of what casts shadows."""
+        shading, groups = casters
+        matter = bulk(shading)
         if room is None or not room.fits(gaussians.count, matter):
             radius = _ROOM * matter.radius
             grid = grid_for(gaussians, cell=self.normal_cell, radius=radius)
@@ -237,11 +266,81 @@ class Render(Stage):
         lit = Lit(
             pack_lamps(lamps, faces, gaussians.means),
             lighting.around(gaussians.means),
-            shadow_maps(gaussians, lamps, faces, texels, matter, groups=groups),
+            shadow_maps(shading, lamps, faces, texels, matter, groups=groups),
             room.grid.of(gaussians, matter.center),
             lighting.occlusion,
         )
         return lit, room
+
+
+def _as_body(gaussians: Gaussians, clear: Clear, eye: Tensor) -> Gaussians:
+    """The splats, those of clear liquids as transparent as their bodies are."""
+    rows = clear.rows.nonzero()[:, 0]
+    body = body_opacities(gaussians.select(rows), clear, eye)
+    return gaussians.replace(
+        opacities=gaussians.opacities.index_copy(0, rows, body.to(gaussians.opacities))
+    )
+
+
+def _wetted(
+    behind: tuple[Tensor, Tensor, Tensor],
+    everything: tuple[Gaussians, Tensor | None],
+    clear: Clear,
+    camera: Camera,
+    view: tuple[Tensor, Tensor],
+    lit: Lit | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Picture, opacity and depth with clear liquids before what is behind them.
+
+    Args:
+        behind: The picture of all else, its opacity and depth.
+        everything: All splats, the liquids' as transparent as their bodies, and their groups.
+        clear: The liquids.
+        camera: Where from.
+        view: Its matrices.
+        lit: The light; None for none.
+    """
+    image, alpha, depth = behind
+    gaussians, groups = everything
+    size, eye = (camera.width, camera.height), -(view[0][:3, 3] @ view[0][:3, :3])
+    rows = clear.rows.nonzero()[:, 0]
+    mine = gaussians.select(rows)
+    spacing = float(clear.volume.median()) ** (1.0 / 3.0)
+    paint = torch.zeros_like(gaussians.means)
+    paint = torch.cat([paint, paint[:, :1]], dim=1)
+    paint[rows] = torch.cat([mine.colors(), torch.ones_like(mine.means[:, :1])], dim=1).to(paint)
+    body = draw_at(gaussians, *view, size, colors=paint, near=_NEAR, groups=groups).image
+    front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
+    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=plate_normals(front, eye))
+    assert seen.depth is not None and seen.normal is not None  # asked for
+    surface = smoothed(Surface(seen.alpha, seen.depth, seen.normal), spacing, camera)
+    there = in_front(surface, alpha, depth, spacing)
+    taken, color = body[..., 3], body[..., :3]
+    if lit is not None:
+        none = torch.zeros_like(image[0, 0])
+        planes = (color, taken, surface.depth, surface.normal)
+        dull = _constant((0.0, 1.0), image.dtype, image.device)
+        color = _shaded(planes, dull, view, _open(lit), none, None)
+    shown = to_linear(image * (1.0 - taken[..., None]) + color)
+    if lit is not None:
+        planes = (torch.zeros_like(image), torch.ones_like(alpha), surface.depth, surface.normal)
+        shine = _shaded(planes, clear.gloss.to(image), view, _open(lit), none, None)
+        _, rays = surface_points(surface.depth, *view)
+        share, toward = mirrored(surface.normal, rays)
+        mirror = ceiling(toward)[..., None] + irradiance(lit.environment, toward)
+        share = (share * there)[..., None]
+        shown = shown * (1.0 - share) + share * mirror + there[..., None] * to_linear(shine)
+    nearer = (seen.alpha > 0.5) & ((surface.depth < depth) | (alpha < 0.5))
+    return (
+        to_display(shown).clamp(0.0, 1.0),
+        1.0 - (1.0 - alpha) * (1.0 - seen.alpha),
+        torch.where(nearer, surface.depth, depth),
+    )
+
+
+def _open(lit: Lit) -> Lit:
+    """The light where nothing hides the surroundings: no matter stands on a liquid."""
+    return replace(lit, occlusion=0.0)
 
 
 def _shaded(

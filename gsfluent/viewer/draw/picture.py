@@ -13,7 +13,7 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.light.from_shot import gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.from_shot import gloss_of, light_of, plates_of, transmission_of
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.render.backdrop import Backdrop
@@ -130,7 +130,7 @@ class PictureMaker:
 
     def splats(self, frame: SavedFrame, look: Look) -> Drawn:
         """The splats of a frame as a look shows them."""
-        gaussians, groups, plates = frame.gaussians, frame.groups, frame.anchor < 0
+        gaussians, groups, plates = frame.gaussians, frame.groups, plates_of(frame)
         gloss = None if self.shot is None else gloss_of(self.shot, frame)
         clear = None
         colors, legend = splat_colors(frame, self.timeline, look.color_by)

@@ -10,7 +10,7 @@ from gsfluent import materials, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
-from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, wide_cuts
+from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, find_faces, wide_cuts
 from gsfluent.pipeline.cracks.chunks import OPACITY
 from gsfluent.pipeline.cracks.cuts import in_turns
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
@@ -104,6 +104,34 @@ def test_a_split_alone_changes_no_picture(bound: Carry, bent: float) -> None:
     assert before.added == 0
     change = (picture(before.gaussians).image - picture(after.gaussians).image).abs()
     assert float(change.max()) < 1.0 / 255.0
+
+
+def test_pores_are_pits(bound: Carry) -> None:
+    """Lightness is height: faces lean away from what is lighter, on the way up to it."""
+    history = Repair().begin(bound)
+    history.step(moment(bound, halves(bound), apart(bound, 0.1)))
+    partition = history._gaps._partitions[0]
+    solid = history._gaps._solid(0)
+    z = solid.origin[2] + solid.voxel * (torch.arange(solid.depth.shape[2]) + 0.5)
+    wave, white = 40.0, torch.ones(*solid.depth.shape, 3)
+    striped = solid.replace(color=white * (0.5 + 0.3 * torch.sin(wave * z))[:, None])
+    flat, plain, high = (
+        find_faces(partition, partition.splits[:1], one, [0], relief)
+        for one, relief in ((solid, 0.0), (striped, 0.0), (striped, 0.03))
+    )
+    assert torch.equal(flat.normals, plain.normals) and torch.equal(flat.quats, plain.quats)
+    assert float((high.means - flat.means).norm(dim=1).max()) < 0.1 * partition.voxel
+    # elements across the stripes, away from the rind
+    inner = (partition.depth_at(high.means) > 3.0 * partition.voxel) & (high.key % 2 == 0)
+    inner &= flat.normals[:, 0].abs() > 0.95
+    place = partition.own(high.means[inner]).to(torch.float32)
+    slope = 0.03 * 0.3 * wave * torch.cos(wave * place[:, 2])
+    lean = high.normals[inner, 2] / high.normals[inner, 0].abs()
+    lean = lean - flat.normals[inner, 2] / flat.normals[inner, 0].abs()
+    assert int(inner.sum()) > 50
+    assert float(torch.corrcoef(torch.stack([lean, -slope]))[0, 1]) > 0.95
+    assert float((lean + slope).abs().mean()) < 0.3 * float(slope.abs().mean())
+    torch.testing.assert_close(high.normals.norm(dim=1), torch.ones(high.count))
 
 
 def test_what_does_not_split_costs_nothing(bound: Carry) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from test_chunks import apart, binding, drawn, halves, moment
@@ -10,6 +12,7 @@ from gsfluent import geometry
 from gsfluent.pipeline.cracks.dust import (
     BETA,
     COARSEST,
+    JUICE,
     MOST,
     SIGMA,
     SPREAD,
@@ -37,7 +40,7 @@ def test_volumes_sum_to_those_of_the_points(least: float, wet: bool) -> None:
         assert float(made.volume[made.row == row].sum()) == pytest.approx(own**3, rel=1e-6)
     inside = (
         made.offset.abs().amax(dim=1)
-        <= 0.5 * edge.repeat_interleave(round(per_point(least))) * 1.001
+        <= 0.5 * edge.repeat_interleave(round(per_point(least, wet))) * 1.001
     )
     assert bool(inside.all())
     assert float(made.toward.norm(dim=1).max()) <= 1.0 + 1e-6
@@ -110,10 +113,14 @@ def test_drops_spread_on_the_floor_and_grains_lie_on_it(wet: bool) -> None:
 
 
 def test_much_dust_has_larger_grains() -> None:
-    assert finest(10.0) == 0.125
-    sizes = [finest(float(n)) for n in (10, 3000, 9000, 30_000, 1e6)]
+    assert finest(10.0, False) == 0.125
+    sizes = [finest(float(n), False) for n in (10, 3000, 9000, 30_000, 1e6)]
     assert sizes == sorted(sizes) and sizes[-1] == 0.5
-    assert all(n * per_point(finest(n)) <= MOST for n in (10.0, 1000.0, 10_000.0))
+    assert all(
+        n * per_point(finest(n, wet), wet) <= MOST
+        for n in (10.0, 1000.0, 10_000.0)
+        for wet in (True, False)
+    )
 
 
 def thrown(bound: Carry, far: float):
@@ -166,6 +173,24 @@ def test_dust_does_not_pop(bound: Carry) -> None:
     assert all(torch.equal(found[0][0], ids) for ids, _ in found)
     opacity = [value for _, value in found]
     assert 0.0 < opacity[0] < opacity[1] < opacity[2] == opacity[3] == opacity[4]
+
+
+def test_drops_are_of_many_sizes_in_the_colour_of_the_flesh(bound: Carry) -> None:
+    made = grains(torch.arange(500), torch.full((500,), 6e-3), 0.25, wet=True)
+    size = (6.0 / torch.pi * made.volume).pow(1.0 / 3.0)
+    assert float(size.max() / size.min()) > 3.5
+    dust = Repair().begin(bound)._gaps._dust
+    solid = bound.scene.bodies[0].solid
+    inside = solid.depth > solid.depth[solid.occupancy].median()
+    rind, flesh = torch.tensor([0.2, 0.5, 0.1]), torch.tensor([0.9, 0.2, 0.2])
+    color = torch.where(inside[..., None], flesh, rind)
+    body = SimpleNamespace(solid=solid.replace(color=color))
+    dust._scene = SimpleNamespace(bodies=(body,))
+    places = bound.matter.rest[:5]
+    drops = dust._juice(0, lambda p: rind.expand(len(p), 3), places)
+    torch.testing.assert_close(
+        drops, torch.lerp(rind, flesh, JUICE).expand(5, 3), atol=0.03, rtol=0
+    )
 
 
 def test_what_lies_scatters_no_more(bound: Carry) -> None:

@@ -22,7 +22,14 @@ from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
-from gsfluent.pipeline.light.from_shot import changed, gloss_of, light_of, transmission_of
+from gsfluent.pipeline.light.from_shot import (
+    DROPS,
+    changed,
+    gloss_of,
+    light_of,
+    plates_of,
+    transmission_of,
+)
 from gsfluent.pipeline.light.glass import as_seen, see_through
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.shade import irradiance, to_linear
@@ -421,8 +428,9 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     loose.anchor[3] = -1  # a blade
     assert float(gloss_of(shot(tmp_path), loose)[3, 0]) > 0.5  # type: ignore[index]
     loose.ids[5], loose.dust = DUST + 7, torch.tensor([5])  # a drop of its juice
-    wet = torch.tensor([materials.get("water").specular, materials.get("water").shininess])
-    torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], wet)  # type: ignore[index]
+    drop = torch.tensor(DROPS)
+    torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], drop)  # type: ignore[index]
+    assert plates_of(loose).nonzero()[:, 0].tolist() == [3, 5]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
 

@@ -1,0 +1,146 @@
+"""Clear liquids in a picture: a body that takes a little of the light, and a surface that reflects.
+
+Splats blend one colour and one normal in a pixel. Where one looks through water at a stone, there
+are two surfaces, so a clear liquid is drawn apart from what is behind it:
+
+* its **body** takes ``1 - exp(-a t)`` of the light behind it, ``t`` the way through it (Beer and
+  Lambert): each splat has the opacity of its own thickness, so that blending multiplies them;
+* its **surface** is that of the same splats when they are opaque. Their normals are smoothed over
+  the spacing of the points, across the picture and not across edges (van der Laan, Green and Sainz
+  2009 smooth depths so); it reflects by Schlick (1994) with the index of water.
+
+No ray is bent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gsfluent.data import Camera, Gaussians
+from gsfluent.geometry import quaternion_to_matrix
+
+FACE_ON = 0.02
+"""Share that is reflected straight on, by an index of 1.33."""
+OPACITY = 0.97
+"""Of a splat of the surface."""
+SMOOTH = 0.8
+"""Standard deviation of the smoothing of normals, in spacings of the points."""
+STEP = 2.0
+"""What lies so many spacings deeper is another surface."""
+MOST_PIXELS = 12
+"""Standard deviation of the smoothing, at most [px]."""
+BRIGHT = 0.75
+"""Linear radiance of the light from above that is reflected; a studio has a bright ceiling."""
+CEILING = (0.25, 0.85)
+"""Height of a unit vector at which the ceiling begins, and where it is all there."""
+
+
+class Clear(NamedTuple):
+    """Splats of clear liquids in a scene.
+
+    Attributes:
+        rows: Which splats they are, bool [N].
+        volume: Volume of the matter of each of them [m^3], [M] (M of ``rows``).
+        attenuation: Of the light in their liquid [1/m], [M].
+        gloss: k_s and n_s of Blinn-Phong, [2].
+    """
+
+    rows: Tensor
+    volume: Tensor
+    attenuation: Tensor
+    gloss: Tensor
+
+
+class Surface(NamedTuple):
+    """The surface of a liquid in a picture.
+
+    Attributes:
+        alpha: Opacity, [H, W].
+        depth: Camera z [m], [H, W].
+        normal: Unit normals toward the eye, [H, W, 3]; zero where there is none.
+    """
+
+    alpha: Tensor
+    depth: Tensor
+    normal: Tensor
+
+
+def body_opacities(splats: Gaussians, clear: Clear, eye: Tensor) -> Tensor:
+    """Opacities [M] of the splats of a liquid as its body, seen from ``eye`` [3].
+
+    A splat of volume V and standard deviations s is ``V / (2 pi s1 s2 s3 |S^-1/2 d|)`` thick where
+    a ray of direction d goes through its middle: then it has its volume.
+    """
+    turn = quaternion_to_matrix(splats.quats)
+    way = normalize(splats.means - eye, dim=1)
+    along = (turn.mT @ way[..., None])[..., 0] / splats.scales
+    shadow = 2.0 * math.pi * splats.scales.prod(dim=1) * along.norm(dim=1)
+    thick = clear.volume.to(shadow) / shadow.clamp(min=1e-30)
+    return 1.0 - torch.exp(-clear.attenuation.to(shadow) * thick)
+
+
+def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
+    """The surface with normals that are smooth over a spacing [m], but not across its edges."""
+    there = surface.alpha > 0.05
+    if not bool(there.any()):
+        return surface
+    depth = torch.where(there, surface.depth, 0.0)
+    middle = float(depth[there].median())
+    sigma = min(SMOOTH * spacing * float(camera.K[0, 0]) / middle, MOST_PIXELS)
+    reach = math.ceil(2.5 * sigma)
+    values = torch.cat([normalize(surface.normal, dim=2), depth[..., None]], dim=2)
+    weight = surface.alpha * there
+    for dim in (0, 1):
+        # a window has no more than the picture
+        values, weight = _blurred(values, weight, sigma, min(reach, depth.shape[dim] - 1), dim,
+                                  STEP * spacing)  # fmt: skip
+    normal = normalize(values[..., :3], dim=2)
+    return Surface(surface.alpha, surface.depth, torch.where(there[..., None], normal, 0.0))
+
+
+def _blurred(
+    values: Tensor, weight: Tensor, sigma: float, reach: int, dim: int, step: float
+) -> tuple[Tensor, Tensor]:
+    """Values [H, W, 4] blurred along a dimension with those of a like depth, their last."""
+    total, many = torch.zeros_like(values), torch.zeros_like(weight)
+    length = weight.shape[dim]
+    for k in range(-reach, reach + 1):
+        count = length - abs(k)
+        here, there = max(0, -k), max(0, k)
+        own, other = values.narrow(dim, here, count), values.narrow(dim, there, count)
+        apart = (own[..., 3] - other[..., 3]) / step
+        near = math.exp(-0.5 * (k / max(sigma, 1e-6)) ** 2) * torch.exp(-apart * apart)
+        near = near * weight.narrow(dim, there, count)
+        total.narrow(dim, here, count).add_(near[..., None] * other)
+        many.narrow(dim, here, count).add_(near)
+    return total / many.clamp(min=1e-12)[..., None], many
+
+
+def in_front(surface: Surface, alpha: Tensor, depth: Tensor, spacing: float) -> Tensor:
+    """Opacity [H, W] of a surface less where opaque things of ``alpha`` and ``depth`` hide it."""
+    behind = ((depth - surface.depth) / spacing + 0.5).clamp(0.0, 1.0)
+    return surface.alpha * (1.0 - alpha * (1.0 - behind))
+
+
+def mirrored(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
+    """What a surface reflects: its share [H, W] by Schlick (1994), and from where, [H, W, 3].
+
+    Args:
+        normal: Unit normals toward the eye, [H, W, 3].
+        rays: Unit vectors from the eye, [H, W, 3].
+    """
+    facing = -(normal * rays).sum(dim=2).clamp(max=0.0)
+    share = FACE_ON + (1.0 - FACE_ON) * (1.0 - facing).clamp(0.0, 1.0) ** 5
+    return share, normalize(rays + 2.0 * facing[..., None] * normal, dim=2)
+
+
+def ceiling(toward: Tensor) -> Tensor:
+    """Radiance [H, W] of the bright ceiling in directions [H, W, 3]."""
+    low, high = CEILING
+    share = ((toward[..., 2] - low) / (high - low)).clamp(0.0, 1.0)
+    return BRIGHT * share * share * (3.0 - 2.0 * share)

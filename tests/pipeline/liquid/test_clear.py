@@ -1,0 +1,149 @@
+"""Clear liquids: how much light goes through, what reflects, and that a gap in them is a hole."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsfluent.data import Camera, Gaussians
+from gsfluent.pipeline.light.lamps import studio_light
+from gsfluent.pipeline.liquid.clear import Clear, Surface, in_front, mirrored, smoothed
+from gsfluent.pipeline.liquid.sheet import ellipsoids
+from gsfluent.pipeline.render.holes import Holes, MatterView
+from gsfluent.pipeline.render.stage import Picture, Render
+from gsfluent.spatial.blue_noise import blue_cylinder
+
+H = 0.004
+LETS = 30.0  # attenuation [1/m]
+
+
+def camera() -> Camera:
+    """Looks down on the origin from 2 m."""
+    return Camera.look_at((0.0, -1e-3, 2.0), (0.0, 0.0, 0.0), width=160, height=160, fov=4.0)
+
+
+def pool(deep: float, gap: float = 0.0) -> tuple[Tensor, Gaussians]:
+    """Points of a round pool, and its splats but those within ``gap`` of the middle [m]."""
+    points = blue_cylinder(0.06, deep, H, seed=3)
+    drawn = ellipsoids(points, points.new_full(points.shape[:1], H**3))
+    kept = drawn.means[:, :2].norm(dim=1) >= gap
+    blue = drawn.means.new_tensor([0.2, 0.3, 0.9]).expand_as(drawn.means)[kept].float()
+    made = Gaussians.from_colors(
+        drawn.means[kept].float(), drawn.scales[kept].float(), blue, opacities=0.4
+    )
+    return points.float(), made.replace(quats=drawn.quats[kept].float())
+
+
+def stone(below: float) -> Gaussians:
+    """An opaque red plate, wider than the picture."""
+    line = torch.arange(-0.08, 0.0801, 0.002)
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, -below)], -1).reshape(-1, 3)
+    red = means.new_tensor([0.8, 0.1, 0.1]).expand_as(means).contiguous()
+    return Gaussians.from_colors(means, torch.full((len(means),), 0.0015), red, opacities=0.98)
+
+
+def drawn(water: Gaussians, *behind: Gaussians, lit: bool = False, clear: bool = True) -> Picture:
+    whole = Gaussians.cat([water, *behind])
+    rows = torch.arange(whole.count) < water.count
+    volume = torch.full((water.count,), H**3)
+    told = Clear(rows, volume, torch.full_like(volume, LETS), torch.tensor([0.9, 200.0]))
+    stage = Render(camera(), studio_light() if lit else None)
+    return stage(whole, clear=told if clear else None)
+
+
+@pytest.mark.parametrize("deep", [0.02, 0.04])
+def test_light_goes_through_by_beer_and_lambert(deep: float) -> None:
+    """A stone under a pool keeps ``exp(-a t)`` of its colour, the pool adds the rest of its own."""
+    _, water = pool(deep)
+    seen = drawn(water, stone(0.5 * deep + 0.02)).image[60:100, 60:100].mean(dim=(0, 1))
+    bare = Render(camera())(stone(0.5 * deep + 0.02)).image[60:100, 60:100].mean(dim=(0, 1))
+    left = math.exp(-LETS * deep)
+    wanted = left * bare + (1.0 - left) * torch.tensor([0.2, 0.3, 0.9])
+    torch.testing.assert_close(seen, wanted, atol=0.04, rtol=0.0)
+
+
+def test_water_is_no_hole_and_a_gap_in_it_is() -> None:
+    """As glass, water is measured as solid; where splats of its points are missing, it is not."""
+    points, water = pool(0.012)
+    _, torn = pool(0.012, gap=0.02)
+    matter = MatterView.of(points, torch.full((len(points),), H**3), camera())
+    far = stone(1.0)
+    far = far.replace(means=far.means + far.means.new_tensor([5.0, 0.0, 0.0]))  # out of the picture
+    found = [Holes.of(p.alpha, p.depth, matter) for p in (drawn(water, far), drawn(torn, far))]
+    through = drawn(water, far, clear=False)
+    assert found[0].fraction < 2e-3
+    # blended by one opacity the same water lets more through than a closed surface may
+    assert Holes.of(through.alpha, through.depth, matter).fraction > found[0].fraction
+    inner = (0.02 - 1.5 * H) ** 2 / 0.06**2  # splats reach into the gap
+    assert inner < found[1].fraction < (0.02 + H) ** 2 / (0.06 - H) ** 2
+
+
+def test_a_wet_surface_glints_and_what_is_before_it_hides_it() -> None:
+    _, water = pool(0.012)
+    wet = drawn(water, stone(0.03), lit=True).image
+    dry = Render(camera(), studio_light())(stone(0.03)).image
+    assert float((wet - dry).abs().mean()) > 0.02
+    lid = stone(-0.05)
+    hidden = drawn(water, lid, lit=True).image
+    alone = Render(camera(), studio_light())(lid).image
+    inside = slice(40, 120)
+    assert float((hidden - alone)[inside, inside].abs().mean()) < 0.02
+
+
+def test_nothing_clear_leaves_the_picture_as_it_was() -> None:
+    rest = stone(0.0)
+    none = Clear(torch.zeros(rest.count, dtype=torch.bool), *(torch.zeros(0),) * 2, torch.ones(2))
+    stage = Render(camera(), studio_light())
+    assert torch.equal(stage(rest, clear=none).image, stage(rest).image)
+
+
+def test_normals_are_smoothed_but_not_across_edges() -> None:
+    generator = torch.Generator().manual_seed(1)
+    normal = torch.tensor([0.0, 0.0, 1.0]).expand(80, 80, 3).clone()
+    normal[:, 40:] = torch.tensor([1.0, 0.0, 0.0])
+    depth = torch.full((80, 80), 2.0)
+    depth[:, 40:] = 2.1
+    rough = normal + 0.3 * torch.randn(80, 80, 3, generator=generator)
+    made = smoothed(Surface(torch.ones(80, 80), depth, rough), H, camera()).normal
+    off = (made * normal).sum(dim=2)
+    before = (torch.nn.functional.normalize(rough, dim=2) * normal).sum(dim=2)
+    assert float(off.min()) > 0.97 > 0.8 > float(before.min())
+    empty = Surface(torch.zeros(80, 80), depth, rough)
+    assert smoothed(empty, H, camera()) is empty
+
+
+def test_schlick_and_what_stands_before() -> None:
+    normal = torch.tensor([[[0.0, 0.0, 1.0]] * 3])
+    rays = torch.nn.functional.normalize(
+        torch.tensor([[[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, -1e-6]]]), dim=2
+    )
+    share, toward = mirrored(normal, rays)
+    assert share[0].tolist() == pytest.approx(
+        [0.02, 0.02 + 0.98 * (1 - 0.5**0.5) ** 5, 1.0], abs=1e-4
+    )
+    torch.testing.assert_close(toward[0, 1], torch.tensor([0.5**0.5, 0.0, 0.5**0.5]))
+    surface = Surface(torch.ones(1, 3), torch.full((1, 3), 2.0), normal)
+    depth = torch.tensor([[1.0, 2.0, 3.0]])
+    assert in_front(surface, torch.ones(1, 3), depth, H)[0].tolist() == pytest.approx(
+        [0.0, 0.5, 1.0]
+    )
+
+
+@pytest.mark.cuda
+def test_the_same_water_on_a_gpu() -> None:
+    _, water = pool(0.012)
+    whole = Gaussians.cat([water, stone(0.03)])
+    found = []
+    for device in ("cpu", "cuda"):
+        rows = (torch.arange(whole.count) < water.count).to(device)
+        volume = torch.full((water.count,), H**3, device=device)
+        told = Clear(rows, volume, torch.full_like(volume, LETS), volume.new_tensor([0.9, 200.0]))
+        stage = Render(camera(), studio_light())
+        made = stage(whole.to(device), clear=told)
+        found.append((made.image.cpu(), made.alpha.cpu()))
+    for one, other in zip(*found, strict=True):
+        assert float((one - other).abs().mean()) < 1e-3
