@@ -25,7 +25,12 @@ from gsfluent import ops
 from gsfluent.figure.markdown import enter
 from gsfluent.fracturebench.registry import cases, find, judge
 from gsfluent.fracturebench.run import Measure
-from gsfluent.fracturebench.scenes.cantilever import cantilever, crack_tip
+from gsfluent.fracturebench.scenes.cantilever import (
+    cantilever,
+    crack_length,
+    crack_tip,
+    per_area,
+)
 from gsfluent.fracturebench.scenes.plane import notch
 from gsfluent.fracturebench.scenes.rock import experiment
 from gsfluent.io.atomic import atomic_path
@@ -131,6 +136,7 @@ class Balance:
     transfer: float  # kinetic energy that the transfer took from them
     near: float  # the latter, of the points that can break
     reference: float  # of the row
+    cracks: float  # side by side: their length over the way of the tip
 
 
 def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0.0, **options: Any
@@ -168,16 +174,14 @@ def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0
     )  # fmt: skip
     run = dataclasses.replace(run, x=run.x - shift)
     (judged,) = judge(scene, run)
-    tip = crack_tip(scene, run.damage, 0.1875, 0.0625) if run.damage is not None else np.zeros(0)
-    plastic, transfer, close = (per_area(tip, energy, dx) for energy in np.stack(rows_of_samples).T)
-    return Balance(judged.value, plastic, transfer, close, judged.reference)
-
-
-def per_area(tip: np.ndarray, energy: np.ndarray, width: float) -> float:
-    """Slope of an energy over the area of the crack where the case takes it [J/m^2]."""
-    on = (tip >= 0.3125) & (tip <= 0.5)
-    away = tip[on] - tip[on].mean()
-    return float((away * energy[on]).sum() / (away * away).sum()) / width
+    damage = np.zeros((0, scene.count)) if run.damage is None else run.damage
+    tip, length = (f(scene, damage, 0.1875, 0.0625) for f in (crack_tip, crack_length))
+    plastic, transfer, close = (
+        per_area(tip, energy, dx, length) for energy in np.stack(rows_of_samples).T
+    )
+    there = (tip > 0.25) & (tip <= 0.5)
+    side = float(length[there][-1] / (tip[there][-1] - 0.25))
+    return Balance(judged.value, plastic, transfer, close, judged.reference, side)
 
 
 SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -197,15 +201,15 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 def accounts(quick: bool) -> list[str]:
     """Rows of the table of where the cantilever's energy goes."""
     rows = [
-        "| setting | energy gone | over that of the row | plastic work | taken by the transfer | "
-        "of it where matter can break |",
-        "|---|---|---|---|---|---|",
+        "| setting | cracks | energy gone | over that of the row | plastic work | taken by the "
+        "transfer | of it where matter can break |",
+        "|---|---|---|---|---|---|---|",
     ]
     for name, options in SETTINGS[: 1 if quick else None]:
         b = balance(**{"dx": 1.0 / 32.0, **options})
         rows.append(
-            f"| {name} | {b.gone:.0f} J/m^2 | {b.gone / b.reference:.2f} | {b.plastic:.0f} J/m^2 | "
-            f"{b.transfer:.0f} J/m^2 | {b.near:.0f} J/m^2 |"
+            f"| {name} | {b.cracks:.1f} | {b.gone:.0f} J/m^2 | {b.gone / b.reference:.2f} | "
+            f"{b.plastic:.0f} J/m^2 | {b.transfer:.0f} J/m^2 | {b.near:.0f} J/m^2 |"
         )
         sys.stderr.write(f"{rows[-1]}\n")
     return rows

@@ -45,9 +45,11 @@ WHOLE = 0.95
 CRUSHED = 0.5
 """Share of the mass that ever broke from which a specimen is broken, in however many pieces."""
 HAIRLINE = 0.005
-"""Share of an egg's shell that ever broke from which it is cracked."""
+"""Share of an egg's shell or of a pane that ever broke from which it is cracked."""
 SHELL = 4.0
 """How many times thicker the shell of the egg is made; see :func:`thicker`."""
+FRAME = 8.0
+"""Thickness of a frame, and how far it reaches beyond its plate [cells]."""
 LEAST = 6
 """Traversals that a fall lasts at least, and that a body has to lie still that does not rebound."""
 Vector = tuple[float, float, float]
@@ -70,6 +72,7 @@ class Case:
         limit: Longest time of a fall, in traversals of the longest side by the wave.
         hairline: Whether a crack is enough.
         prefer: What a grid keeps that is too coarse for both; a height is a matter of strength.
+        rabbet: Width of the ledge of a frame on which its edges lie [m], or None: it falls free.
     """
 
     name: str
@@ -78,6 +81,7 @@ class Case:
     limit: float
     hairline: bool = False
     prefer: str = "toughness"
+    rabbet: float | None = None
 
     def spacing(self, coarse: bool) -> float:
         """Node spacing [m]; ``coarse`` is half the cells."""
@@ -91,10 +95,11 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
         shell = egg(given["length_m"], given["diameter_m"], SHELL * given["wall_m"])
         lies = turned(shell, "y", 90.0) if name == "egg_on_side" else shell
         return Case(name, lies, 2.0, 40.0, hairline=True, prefer="strength")
-    if name == "glass_plate_flat":  # nothing falls quite flat
+    if name == "glass_plate_framed":
         return Case(
-            name, turned(box(tuple(given["size_m"])), "y", 1.0), 3.0, 60.0, prefer="strength"
-        )
+            name, box(tuple(given["size_m"])), 3.0, 40.0, hairline=True, prefer="strength",
+            rabbet=given["rabbet_m"],
+        )  # fmt: skip
     if name == "glass_tumbler":
         keys = ("diameter_m", "length_m", "wall_m", "base_m")
         return Case(
@@ -170,7 +175,7 @@ class Drop:
         self.dx = case.spacing(coarse)
         self.body: Solid = solid(case.shape, 0.5 * self.dx)
         self.material = stiff(materials.get(given["preset"]), how).override(prefer=case.prefer)
-        if case.hairline:
+        if case.name.startswith("egg"):
             self.material = thicker(self.material, SHELL, given["mass_kg"], self.body.volume)
         self.points = round(8 * self.body.volume / self.dx**3)
         self.traversal = 2.0 * max(case.shape.half) / self.material.wave_speed
@@ -204,6 +209,21 @@ class Drop:
             frame=frame, velocity=velocity,
         )  # fmt: skip
 
+    def _ledges(self, scene: Scene, place: Vector) -> None:
+        """The frame below the edges of a plate. It has stopped: the plate falls on into it."""
+        width = self.case.rabbet
+        if width is None:
+            return
+        half = [0.5 * n * self.body.voxel for n in self.body.occupancy.shape[:2]]
+        beyond = deep = FRAME * self.dx
+        for axis, across in ((0, 1), (1, 0)):
+            size = [deep, deep, deep]
+            size[axis], size[across] = width + beyond, 2.0 * (half[across] + beyond)
+            for side in (-1.0, 1.0):
+                at = [place[0], place[1], place[2] - 0.5 * deep]
+                at[axis] += side * (half[axis] - width + 0.5 * size[axis])
+                scene.add_collider("box", at=at, size=size)
+
     def _matter(self, places: list[Vector], speeds: list[float], seeds: list[int]) -> Matter:
         """The points of specimens, of which each strength field is made once."""
         for seed in set(seeds) - set(self._specimens):
@@ -232,8 +252,13 @@ class Drop:
 
     def _together(self, specimens: list[tuple[float, int]]) -> None:
         begun = clock.perf_counter()
-        scene = Scene(gravity=(0.0, 0.0, -GRAVITY))
-        wide = [math.ceil(n * self.body.voxel / self.dx) + 12 for n in self.body.occupancy.shape]
+        framed = self.case.rabbet is not None
+        low = -max(self.case.shape.half) if framed else 0.0
+        scene = Scene(gravity=(0.0, 0.0, -GRAVITY), floor=low)
+        margin = 12 + 2 * math.ceil(FRAME) * framed
+        wide = [
+            math.ceil(n * self.body.voxel / self.dx) + margin for n in self.body.occupancy.shape
+        ]
         columns = math.ceil(math.sqrt(len(specimens) * wide[1] / wide[0]))
         speeds = [math.sqrt(2.0 * GRAVITY * height) for height, _ in specimens]
         places = [
@@ -242,6 +267,7 @@ class Drop:
         ]
         for place, speed, (_, seed) in zip(places, speeds, specimens, strict=True):
             self._add(scene, seed, place, (0.0, 0.0, -speed))
+            self._ledges(scene, place)
         matter = self._matter(places, speeds, [seed for _, seed in specimens])
         run = Run(scene, matter, 1.0 / self.traversal)
         count, p = len(specimens), run.matter.particles
@@ -468,6 +494,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=3, help="specimens at a height, at most 5")
     parser.add_argument("--stiffness", nargs="+", choices=STIFFNESS, default=list(STIFFNESS))
     parser.add_argument("--quick", action="store_true", help="half the cells, every second height")
+    parser.add_argument("--cells", type=float, help="cells across, in place of an object's own")
     parser.add_argument("--points", type=float, help="most points of all specimens in a call")
     parser.add_argument("--budget", type=float, help="begin no object after so many seconds")
     parser.add_argument("-o", "--output", type=Path, help="JSON lines; default: beside the page")
@@ -486,6 +513,7 @@ def main(arguments: list[str] | None = None) -> int:
         for how in options.stiffness
         for name in options.only or heights
         if (name, how, options.quick) not in done and not options.only_table
+        and heights[name].get("stiffness", how) == how
         and (how == "preset" or materials.get(heights[name]["preset"]).softening > 1.0)
     ]  # fmt: skip
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -496,7 +524,9 @@ def main(arguments: list[str] | None = None) -> int:
                 sys.stdout.write(f"out of budget, {len(todo) - i} left: run it again\n")
                 break
             report(i, len(todo), f"{name}, {how}")
-            row = study(case_of(name, heights[name]), heights[name], how, options)
+            case = case_of(name, heights[name])
+            case = dataclasses.replace(case, cells=options.cells or case.cells)
+            row = study(case, heights[name], how, options)
             if row is None:
                 continue
             with output.open("a", encoding="utf-8") as file:

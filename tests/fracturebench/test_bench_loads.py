@@ -77,6 +77,28 @@ def test_energy_per_area_is_the_slope_where_the_case_takes_it() -> None:
     assert loads.per_area(tip, bent, 0.1) == pytest.approx(200.0)
 
 
+def test_cracks_side_by_side_are_counted_each() -> None:
+    scene = find("double_cantilever").build(1 / 32, 8)
+    x, y = scene.x[:, 0], scene.x[:, 1] - 0.1875
+    one = (np.abs(y) < 0.03) & (x < 0.5)  # a band of two cells up to x = 0.5
+    two = (np.abs(np.abs(y) - 0.05) < 0.01) & (x < 0.4)
+    wide = (np.abs(y) < 0.06) & (x < 0.4)
+    far = (np.abs(y) > 0.1) & (x < 0.5)
+    damage = np.stack([np.zeros(len(x)), one, two, one & (x < 0.4) | wide, far])
+    found = loads.crack_length(scene, damage.astype(np.float64), 0.1875, 0.0625)
+    ends = [float(x[x < end].max()) + 1 / 128 - 0.25 for end in (0.4, 0.5)]
+    # what touches is one wide crack, and what lies in the arms is none of it
+    assert found == pytest.approx([0.0, ends[1], 2.0 * ends[0], ends[0], 0.0])
+
+
+def test_the_frozen_double_cantilever_has_two_cracks_that_take_what_one_does() -> None:
+    case = find("double_cantilever")
+    both, alone = (loads.balance(case.dx, place=p, cfl=0.8) for p in (0.0, 0.25))
+    assert both.cracks > 1.7 and alone.cracks < 1.2
+    assert both.gone == pytest.approx(alone.gone, rel=0.2)
+    assert abs(both.gone / both.reference - 1.0) < 0.3
+
+
 def test_the_cantilevers_account_is_of_its_frozen_row() -> None:
     case = find("double_cantilever")
     found = loads.balance(case.dx, place=0.25, cfl=0.8)

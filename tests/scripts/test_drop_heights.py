@@ -68,7 +68,9 @@ def test_the_median_is_between_heights_of_which_half_break(drops: ModuleType) ->
     assert middle((1.0, "xxxx"), (4.0, "xxxx")) == (None, 0.0, 1.0)
 
 
-@pytest.mark.parametrize("name", ["egg_on_side", "glass_tumbler", "ceramic_bowl", "bread"])
+@pytest.mark.parametrize(
+    "name", ["egg_on_side", "glass_plate_framed", "glass_tumbler", "ceramic_bowl", "bread"]
+)
 def test_bodies_have_the_mass_of_the_real_ones(drops: ModuleType, name: str) -> None:
     heights = drops.tomllib.loads((drops.DATA / "drop_heights.toml").read_text())
     given = heights[name]
@@ -81,6 +83,35 @@ def test_bodies_have_the_mass_of_the_real_ones(drops: ModuleType, name: str) -> 
         2.0 * case.shape.half[2] / solid.voxel, abs=max(4.0, 0.03 * solid.occupancy.shape[2])
     )
     assert bool(solid.occupancy[:, :, 0].any()) and float(solid.origin[2]) == 0.0
+
+
+def test_a_pane_in_its_frame_cracks_along_its_middle(
+    drops: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its edges are held and its middle falls on: only a high fall breaks it, and in bending."""
+    given = drops.tomllib.loads((drops.DATA / "drop_heights.toml").read_text())[
+        "glass_plate_framed"
+    ]
+    case = dataclasses.replace(drops.case_of("glass_plate_framed", given), cells=1.0, limit=10.0)
+    drop = drops.Drop(case, given, "real", "cpu", coarse=False)
+    runs = []
+
+    class Watched(drops.Run):  # type: ignore[name-defined,misc]
+        def __init__(self, *given: object) -> None:
+            super().__init__(*given)
+            runs.append((self, self.matter.particles.position.clone()))
+
+    monkeypatch.setattr(drops, "Run", Watched)
+    drop.fall([(0.02, 0), (8.0, 0)], 1e6)
+    whole, broken = drop.falls
+    assert (whole.ever, whole.broken, broken.broken) == (0.0, False, True)
+    ((run, start),) = runs
+    second = run.state.particles.body == 1
+    ever, start = run.state.ever[second].bool(), start[second]
+    away = (start[:, 1] - start[:, 1].mean()).abs() / start[:, 1].std()
+    middle = away < 0.7
+    assert bool(ever[middle].any())
+    assert float(ever[middle].float().mean()) > 2.0 * float(ever[~middle].float().mean())
 
 
 def test_a_thicker_shell_is_as_stiff_and_strong_under_a_point(drops: ModuleType) -> None:
