@@ -22,7 +22,8 @@ from gsfluent.io.solid import load_solid
 from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
 from gsfluent.pipeline.partition.mesh import PieceMesh, Surfaces
-from gsfluent.pipeline.partition.tree import Partition, Split
+from gsfluent.pipeline.partition.splits import Split
+from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.results.frames import load_frame
 from gsfluent.results.partition import SavedBody, SavedPartition, load_partition
 from gsfluent.results.record import shot_of

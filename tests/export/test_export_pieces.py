@@ -19,7 +19,7 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError, RunError
 from gsfluent.export.write import export
 from gsfluent.io import save_solid
-from gsfluent.pipeline.partition.tree import ranked
+from gsfluent.pipeline.matter.fragments import ranked
 from gsfluent.results.frames import load_frame, save_frame
 from gsfluent.results.partition import FILE, SavedBody, SavedPartition, SavedSplit, save_partition
 

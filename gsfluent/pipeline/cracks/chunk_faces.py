@@ -7,6 +7,7 @@ All of it is at rest and made once, when a region is split
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,7 +17,8 @@ from gsfluent import geometry, ops
 from gsfluent.data import Gaussians, Solid
 from gsfluent.pipeline.cracks.cuts import REACH, cut_at
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
-from gsfluent.pipeline.partition.tree import Partition, Split
+from gsfluent.pipeline.partition.splits import Split, Splits
+from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.spatial.neighbours import nearest_in_group
 
 INSET = 0.15
@@ -27,6 +29,7 @@ CRUST = 0.5
 """Depth [voxels of the colours] to which an element wears the colour of the skin."""
 _STEP = 1.5  # voxels that an element may be moved onto its face
 _LEAST = 1e-12
+_NUMBER = 41  # bits of a key below the number of its split
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,22 +99,69 @@ class ChunkCuts(NamedTuple):
     rival: Tensor
 
 
-def find_faces(partition: Partition, split: Split, solid: Solid, number: int) -> ChunkFaces:
-    """Face elements of a split: one in every voxel beside a voxel of another piece.
+def find_faces(
+    partition: Partition, splits: Sequence[Split], solid: Solid, numbers: Sequence[int]
+) -> ChunkFaces:
+    """Face elements of splits: one in every voxel beside a voxel of another piece.
 
     Owner and rival are left to the caller (-1).
 
     Args:
         partition: Of the body.
-        split: What was done.
+        splits: What was done, to regions that none of the others touched; at least one.
         solid: The body's solid, for the colours.
-        number: Number of the split, which enters the keys.
+        numbers: Number of each split, which enters the keys.
     """
-    first, edge = split.labels.first.long(), partition.voxel
-    device = first.device
+    edge, seen = partition.voxel, Splits(splits)
+    sites = [_beside(partition, split) for split in splits]
+    grid, other = (torch.cat(part) for part in zip(*sites, strict=True))
+    of = torch.arange(len(splits), device=grid.device).repeat_interleave(
+        torch.tensor([len(site) for site, _ in sites], device=grid.device), output_size=len(grid)
+    )
+    label, second = seen.labels(of, grid)
+    beyond = torch.where((second >= 0) & (second != label), second, other)
+    far, gradient = seen.slope(of, label, grid, edge)
+    slope = gradient.norm(dim=1).clamp(min=_LEAST)
+    normal = -gradient / slope[:, None]
+    reach = (far / slope.clamp(min=0.2)).clamp(0.0, _STEP * edge)
+    center = partition.center(grid).to(torch.float32)
+    below = partition.depth[grid.unbind(dim=1)]
+    outward = _outward(partition, grid)
+    flat = (grid[:, 0] * partition.shape[1] + grid[:, 1]) * partition.shape[2] + grid[:, 2]
+    number = torch.tensor(list(numbers), dtype=torch.int64, device=grid.device)[of]
+    matter, skin = _colors(partition, solid, center, below)
+    crust = below < min(CRUST * partition.solid_voxel, edge)
+    common = {
+        "voxel": flat, "region": seen.region(of, label), "beyond": seen.region(of, beyond),
+        "number": number,
+    }  # fmt: skip
+    spot = center + (reach - INSET * edge)[:, None] * normal
+    parts = [
+        _elements(
+            spot, normal, edge, torch.where(crust[:, None], skin, matter), 0,
+            (outward, below - ((spot - center) * outward).sum(dim=1)), **common,
+        )
+    ]  # fmt: skip
+    # the skin along the rim, which splats cut at the face leave open
+    rim = below < 1.2 * edge
+    place = center + (below - INSET * edge)[:, None] * outward
+    left = reach - ((place - center) * normal).sum(dim=1)
+    parts.append(
+        _elements(
+            place, outward, edge, skin, 1, (normal, left), **common
+        ).select(rim & (left > -edge))
+    )  # fmt: skip
+    made = ChunkFaces.joined(parts)
+    return (
+        made if len(splits) == 1 else made.select(torch.argsort(made.key >> _NUMBER, stable=True))
+    )
+
+
+def _beside(partition: Partition, split: Split) -> tuple[Tensor, Tensor]:
+    """Voxels of the body's grid beside one of another piece [M, 3], and the label there [M]."""
+    first = split.labels.first
     span = tuple(slice(a, a + n) for a, n in zip(split.low, first.shape, strict=True))
-    depth = partition.depth[span]
-    inside = (first >= 0) & (depth > 0.0)
+    inside = (first >= 0) & (partition.depth[span] > 0.0)
     face = torch.zeros_like(inside)
     other = torch.full_like(first, -1)
     for axis in range(3):
@@ -124,45 +174,13 @@ def find_faces(partition: Partition, split: Split, solid: Solid, number: int) ->
             part = other.narrow(axis, start, n - 1)
             part.copy_(torch.where(both, theirs, part))
     voxel = face.nonzero()
-    x, y, z = voxel.unbind(dim=1)
-    label = first[x, y, z]
-    second = split.labels.second[x, y, z].long()
-    beyond = torch.where((second >= 0) & (second != label), second, other[x, y, z])
-    far, gradient = split.slope(label, voxel, edge)
-    slope = gradient.norm(dim=1).clamp(min=_LEAST)
-    normal = -gradient / slope[:, None]
-    reach = (far / slope.clamp(min=0.2)).clamp(0.0, _STEP * edge)
-    grid = voxel + torch.tensor(split.low, device=device)
-    center = partition.center(grid).to(torch.float32)
-    below = depth[x, y, z]
-    outward = _outward(partition, grid)
-    table = torch.tensor(split.ids, device=device)
-    flat = (grid[:, 0] * partition.shape[1] + grid[:, 1]) * partition.shape[2] + grid[:, 2]
-    matter, skin = _colors(partition, solid, center, below)
-    crust = below < min(CRUST * partition.solid_voxel, edge)
-    common = {"voxel": flat, "region": table[label], "beyond": table[beyond]}
-    spot = center + (reach - INSET * edge)[:, None] * normal
-    parts = [
-        _elements(
-            spot, normal, edge, torch.where(crust[:, None], skin, matter), number, 0,
-            (outward, below - ((spot - center) * outward).sum(dim=1)), **common,
-        )
-    ]  # fmt: skip
-    # the skin along the rim, which splats cut at the face leave open
-    rim = below < 1.2 * edge
-    place = center + (below - INSET * edge)[:, None] * outward
-    left = reach - ((place - center) * normal).sum(dim=1)
-    parts.append(
-        _elements(
-            place, outward, edge, skin, number, 1, (normal, left), **common
-        ).select(rim & (left > -edge))
-    )  # fmt: skip
-    return ChunkFaces.joined(parts)
+    low = torch.tensor(split.low, device=voxel.device)
+    return voxel + low, other[voxel.unbind(dim=1)].long()
 
 
 def _elements(
-    means: Tensor, normal: Tensor, edge: float, color: Tensor, number: int, kind: int,
-    plane: tuple[Tensor, Tensor], *, voxel: Tensor, region: Tensor, beyond: Tensor,
+    means: Tensor, normal: Tensor, edge: float, color: Tensor, kind: int,
+    plane: tuple[Tensor, Tensor], *, number: Tensor, voxel: Tensor, region: Tensor, beyond: Tensor,
 ) -> ChunkFaces:  # fmt: skip
     """Flat elements that end at a plane: its unit normal, and how far off it is [m]."""
     reference = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
@@ -175,7 +193,7 @@ def _elements(
     quats, scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
     none = torch.full_like(voxel, -1)
     return ChunkFaces(
-        key=(((number << 40) + voxel) << 1) + kind, voxel=voxel, region=region, beyond=beyond,
+        key=(number << _NUMBER) + (voxel << 1) + kind, voxel=voxel, region=region, beyond=beyond,
         means=means, quats=quats, scales=scales, color=color, normals=normal,
         owner=none, rival=none, ash=none,
     )  # fmt: skip
@@ -221,38 +239,30 @@ def colors_at(partition: Partition, solid: Solid, means: Tensor) -> Tensor:
 
 
 def find_cuts(
-    partition: Partition, split: Split, splats: Gaussians, rows: Tensor
+    partition: Partition, splits: Sequence[Split], splats: Gaussians, rows: Tensor, of: Tensor
 ) -> tuple[Tensor, ChunkCuts]:
-    """Which splats a split divides.
+    """Which splats are divided by splits.
 
     Args:
         partition: Of the body.
-        split: What was done.
+        splits: What was done, to regions that none of the others touched; at least one.
         splats: At rest.
-        rows: Those of the region that was split, int64 [M].
+        rows: Those of the regions that were split, int64 [M].
+        of: Number of the split of each, int64 [M].
 
     Returns:
         The region of each row now, int64 [M], and the cuts; rivals are left to the caller (-1).
     """
-    edge, device = partition.voxel, rows.device
-    means = splats.means[rows]
-    place = partition.place(means) - torch.tensor(split.low, device=device)
+    edge, seen = partition.voxel, Splits(splits)
+    place = partition.place(splats.means[rows])
     voxel = place.round().long()
-    size = torch.tensor(split.face.shape, device=device)
-    here = ((voxel >= 0) & (voxel < size)).all(dim=1)
-    table = torch.tensor(split.ids, device=device)
-    region = torch.full_like(rows, split.ids[0])
-    found = here.nonzero()[:, 0]
-    x, y, z = voxel[found].unbind(dim=1)
-    label = split.labels.first[x, y, z].long()
+    label, second = seen.labels(of, voxel)
     # a splat off the matter goes with the matter beside it
-    known = label >= 0
-    found, label = found[known], label[known]
-    region[found] = table[label]
+    region = seen.region(of, label.clamp(min=0))
+    found = (label >= 0).nonzero()[:, 0]
+    of, label, second = of[found], label[found], second[found]
     voxel, place = voxel[found], place[found]
-    x, y, z = voxel.unbind(dim=1)
-    second = split.labels.second[x, y, z].long()
-    far, gradient = split.slope(label, voxel, edge)
+    far, gradient = seen.slope(of, label, voxel, edge)
     far = far + (gradient * ((place - voxel) * edge).to(gradient)).sum(dim=1)
     slope = gradient.norm(dim=1).clamp(min=_LEAST)
     normal = -gradient / slope[:, None]
@@ -261,9 +271,9 @@ def find_cuts(
     root = root * splats.scales[rows[found], None]
     sigma = (normal[:, None] @ root)[:, 0].norm(dim=1)
     cut = (second >= 0) & (distance < REACH * sigma)
-    found, second = found[cut], second[cut]
+    beyond = seen.region(of[cut], second[cut])
     return region, ChunkCuts(
-        rows[found], table[second], normal[cut], distance[cut], torch.full_like(second, -1)
+        rows[found[cut]], beyond, normal[cut], distance[cut], torch.full_like(beyond, -1)
     )
 
 
@@ -277,10 +287,10 @@ def wide_cuts(
 
     Args:
         splats: At rest.
-        rows: Those of the region that was split, int64 [M].
+        rows: Those of the regions that were split, int64 [M].
         region: Region of each now, int64 [M].
-        cuts: Those near the face.
-        faces: Elements that the split made.
+        cuts: Those near the faces.
+        faces: Elements that the splits made.
         cell: Cell of the search [m].
     """
     known = torch.isin(rows, cuts.splat) | ~torch.isin(region, faces.region)

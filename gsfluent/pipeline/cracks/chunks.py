@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -33,12 +34,13 @@ from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
 from gsfluent.pipeline.cracks.followers import WIDE, Followers, chips, motions, neighbours
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
+from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude
-from gsfluent.pipeline.partition.threshold import CHIP as PIECE
-from gsfluent.pipeline.partition.tree import Partition, ranked
+from gsfluent.pipeline.partition.splits import Split
+from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
 from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
 
@@ -53,10 +55,6 @@ STRAY, BAND = 1.0, 4.0
 as well; asked of points that lay so many spacings from those, the width of a crack band."""
 LUMP = 64
 """Points of one piece that hang together, below which they are crumbs as well."""
-PART = 3
-"""Points of a piece in a region for which that is divided; a chip may lie across two."""
-MOST = 32_000
-"""Pieces that a region is split into at once, at most."""
 _NUMBERS = 1 << 54  # ids of face elements begin here, beyond those of births
 
 
@@ -111,17 +109,25 @@ class Chunks:
         self._region = self.base.body.clone()
         self._owner = self.base.owner
         self._links = self.base.links
+        torn: list[Torn] = []
         done = list(state.get("splits", ()))
         while done:
             event = done.pop(0)
-            self._steps = int(event.get("frame", 0))
+            step = int(event.get("frame", 0))
+            known = {part.region for part in torn}
+            alike = step == self._steps and int(event["region"]) not in known
+            if "melted" in event or not alike or int(event["region"]) >= self._regions:
+                self._divide(torn)
+                torn, self._steps = [], step
             if "melted" in event:
                 group = [event, *done[: int(event["melted"]) - 1]]
                 del done[: len(group) - 1]
                 self._melt([(int(e["region"]), e["rows"].to(device)) for e in group])
                 continue
-            rows, rank = event["rows"].to(device), event["rank"].to(device)
-            self._split(int(event["region"]), rows, rank, int(event.get("dust", -1)))
+            rows, rank = event["rows"].to(device), event["rank"].to(device).long()
+            pieces, dust = int(rank.max()) + 1, int(event.get("dust", -1))
+            torn.append(Torn(int(event["region"]), rows, rank, pieces, dust))
+        self._divide(torn)
         self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
@@ -211,38 +217,20 @@ class Chunks:
         goes with most of its points, or is dust when most of them are.
         """
         count = unit.shape[0]
+        label = torch.where(unit < 0, count, unit)
         while True:
-            label = torch.where(unit < 0, count, unit)
-            counted = self._may & ~self._gone
-            pair, many = torch.unique(
-                self._chunk[counted] * (count + 1) + label[counted], return_counts=True
-            )
-            chunk, piece = pair // (count + 1), pair % (count + 1)
-            enough = (many >= PART) | (piece == count)
-            times = torch.bincount(chunk[enough], minlength=self._regions)
-            size, dusty = (torch.zeros_like(times) for _ in range(2))
-            size.index_add_(0, chunk, many)
-            dusty.index_add_(0, chunk, torch.where(piece == count, many, 0))
-            chip = size < PIECE
-            chip[: len(self._scene.bodies)] = False  # a small body is none
-            torn = (((times > 1) | (dusty > 0)) & ~chip).nonzero()[:, 0].tolist()
-            melted = (chip & (2 * dusty > size)).nonzero()[:, 0].tolist()
+            counted = (self._may & ~self._gone).nonzero()[:, 0]
+            shares = Shares.of(self._chunk[counted], label[counted], count)
+            torn, melted = shares.parting(self._regions, len(self._scene.bodies))
             if not torn and not melted:
                 break
-            for region in torn:
-                units, members = (x[enough & (chunk == region)] for x in (piece, many))
-                if units.numel() > MOST:  # labels are small numbers; the rest goes where it lay
-                    units = units[members.argsort(descending=True, stable=True)[:MOST]]
-                mine = counted & (self._chunk == region)
-                rows = (mine & torch.isin(label, units)).nonzero()[:, 0]
-                names, rank = ranked(label[rows], self.base.matter.rest[rows])
-                dust = (names == count).nonzero()
-                self._split(region, rows, rank, int(dust[0]) if len(dust) else -1)
+            self._divide(shares.torn(torn, counted, self.base.matter.rest))
             if melted:
-                counted &= ~self._gone  # what was split may have led its dust to a chip
-                mine = (counted & torch.isin(self._chunk, self._numbers(melted))).nonzero()[:, 0]
+                mine = counted[~self._gone[counted]]  # a split may have led its dust to a chip
+                mine = mine[torch.isin(self._chunk[mine], self._numbers(melted))]
                 of = self._chunk[mine]
                 self._melt([(region, mine[of == region]) for region in melted])
+        chunk, piece, many = shares.chunk, shares.piece, shares.many
         # a region moves with the piece that most of its points belong to
         most = torch.zeros(self._regions, dtype=torch.int64, device=unit.device)
         most.scatter_reduce_(0, chunk, many, "amax")
@@ -252,61 +240,91 @@ class Chunks:
         theirs = lead[self._chunk]
         self._drives = ~self._may | (unit == theirs) | (theirs == count)
 
-    def _split(self, region: int, rows: Tensor, rank: Tensor, dust: int) -> None:
-        """Divide a region by the pieces of some of its points, one of which may be dust."""
-        event = {"region": region, "rows": rows, "rank": rank.to(torch.int32), "dust": dust}
-        self._events.append({**event, "frame": self._steps})
-        matter = self.base.matter
-        body = int(self._body[rows[0]])
-        partition = self._partitions.get(body)
-        rest, rank = matter.rest, rank.long()
-        solid = self._solid(body)
-        if partition is None:
-            a, b = matter.ranges[body]
-            partition = Partition(
-                solid, body_frame(self._scene.bodies[body], self._scene), rest[a:b],
-                matter.spacing[body], body, amplitude(self._scene.bodies[body].material.name),
-            )  # fmt: skip
-            self._partitions[body] = partition
-        pieces = int(rank.max()) + 1
-        ids = [region, *range(self._regions, self._regions + pieces - 1)]
-        self._regions += pieces - 1
-        thrown, ash = rows[rank == dust], ids[dust] if dust >= 0 else -1
-        if dust >= 0:
-            self._gone = self._gone.index_fill(0, thrown, True)
-            self._dust.add(thrown, functools.partial(colors_at, partition, solid))
-        splats = (self._region == region).nonzero()[:, 0]
-        if pieces == 1:  # all of it is dust
-            self._home(region, ids, rows[:0], body)
-            self._burn(splats, thrown)
-            self._reassign(region, partition, rows, ash, thrown)
-            return
-        split = partition.split(region, rest[rows], rank, ids, dust)
-        self._chunk = partition.assign(self._chunk, split, rest, rows, rank)
-        rows = rows[rank != dust]  # dust has no place to go by
-        self._home(ash, ids, rows, body)
-        self._reassign(region, partition, rows, ash, thrown)
-        here, cuts = find_cuts(partition, split, self.base.gaussians, splats)
-        self._region = self._region.index_copy(0, splats, here)
-        owner, means = self._owner[splats], self.base.gaussians.means[splats]
-        wrong = self._chunk[owner] != here
-        owner[wrong] = self._nearest(means[wrong], here[wrong], rows)
-        self._owner = self._owner.index_copy(0, splats, owner)
-        self._burn(splats[here == ash], thrown)
-        made = find_faces(partition, split, solid, len(self._events) - 1)
-        made = made.select(made.region != ash)
-        spacing = matter.spacing[body]
-        cuts = wide_cuts(self.base.gaussians, splats, here, cuts, made, spacing)
-        cuts = ChunkCuts(*(part[self._region[cuts.splat] != ash] for part in cuts))
-        means = self.base.gaussians.means[cuts.splat]
-        self._cuts.append(cuts._replace(rival=self._across(means, cuts.beyond, rows, ash, thrown)))
+    def _divide(self, torn: list[Torn]) -> None:
+        """Divide regions, those of a body that part into pieces at once: it costs little more."""
+        together: dict[int, tuple[list[int], list[Torn]]] = {}
+
+        def split() -> None:
+            for body, (numbers, parts) in together.items():
+                self._split(body, numbers, parts)
+            together.clear()
+
+        for part in torn:
+            event = {"region": part.region, "rows": part.rows, "rank": part.rank.to(torch.int32)}
+            self._events.append({**event, "dust": part.dust, "frame": self._steps})
+            if part.pieces > 1:
+                numbers, parts = together.setdefault(int(self._body[part.rows[0]]), ([], []))
+                numbers.append(len(self._events) - 1)
+                parts.append(part)
+            else:
+                split()
+                self._vanish(part)
+        split()
+
+    def _vanish(self, part: Torn) -> None:
+        """All points of a region have become dust: it keeps its voxels, and is led by others."""
+        body, region = int(self._body[part.rows[0]]), part.region
+        self._throw(body, part.rows)
+        theirs = self._chunk == region
+        firm = self._may & ~self._gone & (self._body == body) & ~theirs
+        self._led_by(theirs.nonzero()[:, 0], firm.nonzero()[:, 0])
+        sides = self._sides(body, [part], [[region]])
+        self._burn((self._region == region).nonzero()[:, 0], sides)
+        self._reassign(sides, self._partition(body))
+
+    def _split(self, body: int, numbers: list[int], torn: list[Torn]) -> None:
+        """Divide regions of a body by the pieces of some of their points, as so many splits."""
+        matter, splats = self.base.matter, self.base.gaussians
+        partition, solid = self._partition(body), self._solid(body)
+        splits: list[Split] = []
+        for part in torn:
+            new = range(self._regions, self._regions + part.pieces - 1)
+            self._regions = new.stop
+            rest, ids = matter.rest[part.rows], [part.region, *new]
+            splits.append(partition.split(part.region, rest, part.rank, ids, part.dust))
+            self._chunk = partition.assign(
+                self._chunk, splits[-1], matter.rest, part.rows, part.rank
+            )
+        sides = self._sides(body, torn, [split.ids for split in splits])
+        self._throw(body, sides.thrown)
+        # dust goes on belonging to a chunk, which leads it
+        within = self._gone & (sides.of[self._chunk] >= 0)
+        lone = (within | sides.ash[self._chunk]).nonzero()[:, 0]
+        near = sides.firm(matter.rest[lone], self._chunk[lone])
+        self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
+        self._reassign(sides, partition)
+        rows = sides.among(self._region)
+        here, cuts = find_cuts(partition, splits, splats, rows, sides.of[self._region[rows]])
+        self._region = self._region.index_copy(0, rows, here)
+        owner, means = self._owner[rows], splats.means[rows]
+        wrong = (self._chunk[owner] != here).nonzero()[:, 0]
+        owner[wrong] = sides.own(means[wrong], here[wrong])
+        self._owner = self._owner.index_copy(0, rows, owner)
+        self._burn(rows[sides.ash[here]], sides)
+        made = find_faces(partition, splits, solid, numbers)
+        made = made.select(~sides.ash[made.region])
+        cuts = wide_cuts(splats, rows, here, cuts, made, matter.spacing[body])
+        cuts = ChunkCuts(*(part[~sides.ash[self._region[cuts.splat]]] for part in cuts))
+        rival = sides.across(splats.means[cuts.splat], cuts.beyond)
+        self._cuts.append(cuts._replace(rival=rival))
         made = dataclasses.replace(
             made,
-            owner=self._nearest(made.means, made.region, rows),
-            rival=self._across(made.means, made.beyond, rows, ash, thrown),
+            owner=sides.own(made.means, made.region),
+            rival=sides.across(made.means, made.beyond),
         )
         old = [] if self._faces is None else [self._faces]
         self._faces = ChunkFaces.joined([*old, made])
+
+    def _sides(self, body: int, torn: list[Torn], ids: Sequence[Sequence[int]]) -> Sides:
+        matter = self.base.matter
+        return Sides(matter.rest, matter.spacing[body], self._chunk, self._regions, torn, ids)
+
+    def _throw(self, body: int, rows: Tensor) -> None:
+        """Some points of a body have become dust."""
+        if rows.numel():
+            self._gone = self._gone.index_fill(0, rows, True)
+            colors = functools.partial(colors_at, self._partition(body), self._solid(body))
+            self._dust.add(rows, colors)
 
     def _melt(self, chips: list[tuple[int, Tensor]]) -> None:
         """Chips have become dust: regions, and the points of each. All at once: there are hundreds.
@@ -352,6 +370,17 @@ class Chunks:
     def _numbers(self, values: list[int]) -> Tensor:
         return torch.tensor(values, dtype=torch.int64, device=self._chunk.device)
 
+    def _partition(self, body: int) -> Partition:
+        """The partition of a body, made when it first comes apart."""
+        if body not in self._partitions:
+            a, b = self.base.matter.ranges[body]
+            its = self._scene.bodies[body]
+            self._partitions[body] = Partition(
+                self._solid(body), body_frame(its, self._scene), self.base.matter.rest[a:b],
+                self.base.matter.spacing[body], body, amplitude(its.material.name),
+            )  # fmt: skip
+        return self._partitions[body]
+
     def _solid(self, body: int) -> Solid:
         """The solid of a body, where its points are."""
         solid = self._scene.bodies[body].solid
@@ -360,70 +389,39 @@ class Chunks:
             self._solids[body] = solid.to(self.base.matter.rest.device)
         return self._solids[body]
 
-    def _across(
-        self, places: Tensor, region: Tensor, rows: Tensor, ash: int, thrown: Tensor
-    ) -> Tensor:
-        """:meth:`_nearest` of regions across a face; of what is thrown where that is dust."""
-        found = self._nearest(places, region, rows)
-        dust = (region == ash).nonzero()[:, 0]
-        return found.index_copy(0, dust, self._beside(places[dust], thrown))
-
-    def _beside(self, places: Tensor, rows: Tensor) -> Tensor:
-        """Nearest of some rows of each place."""
-        if places.shape[0] == 0:
-            return rows[:0]
-        spacing = self.base.matter.spacing[int(self._body[rows[0]])]
-        return rows[nearest_rows(self.base.matter.rest[rows], places, 1, spacing)[1][:, 0]]
-
-    def _home(self, ash: int, ids: list[int], rows: Tensor, body: int) -> None:
-        """Dust goes on belonging to a chunk, which leads it: that of the nearest of some rows."""
-        within = torch.isin(self._chunk, torch.tensor(ids, device=self._chunk.device))
-        lone = ((self._gone & within) | (self._chunk == ash)).nonzero()[:, 0]
-        if rows.numel() == 0:  # of any other chunk
-            rest = self._may & ~self._gone & (self._body == body) & (self._chunk != ash)
-            rows = rest.nonzero()[:, 0]
-        self._led_by(lone, rows)
-
     def _led_by(self, lone: Tensor, rows: Tensor) -> None:
         """Some points go on with the chunk of the nearest of some rows, where there are any."""
         if lone.numel() and rows.numel():
-            near = self._beside(self.base.matter.rest[lone], rows)
+            rest, spacing = (
+                self.base.matter.rest,
+                self.base.matter.spacing[int(self._body[rows[0]])],
+            )
+            near = rows[nearest_rows(rest[rows], rest[lone], 1, spacing)[1][:, 0]]
             self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
 
-    def _burn(self, splats: Tensor, thrown: Tensor) -> None:
+    def _burn(self, splats: Tensor, sides: Sides) -> None:
         """Splats whose matter has become dust go when that is seen to leave."""
-        near = self._beside(self.base.gaussians.means[splats], thrown)
+        near = sides.burnt(self.base.gaussians.means[splats], self._region[splats])
         self._ash = self._ash.index_copy(0, splats, near)
 
-    def _reassign(
-        self, region: int, partition: Partition, rows: Tensor, ash: int, thrown: Tensor
-    ) -> None:
-        """Older elements of a region go with the part that their voxel lies in."""
+    def _reassign(self, sides: Sides, partition: Partition) -> None:
+        """Older elements of divided regions go with the part that their voxel lies in."""
         faces = self._faces
         if faces is None:
             return
-        stale = (faces.region == region).nonzero()[:, 0]
+        stale = sides.among(faces.region)
         now = partition.region.view(-1)[faces.voxel[stale]].long()
-        owner = faces.owner[stale]
-        wrong = self._chunk[owner] != now
-        owner[wrong] = self._nearest(faces.means[stale[wrong]], now[wrong], rows)
-        burnt = stale[now == ash]
-        near = self._beside(faces.means[burnt], thrown)
+        owner, means = faces.owner[stale], faces.means[stale]
+        wrong = (self._chunk[owner] != now).nonzero()[:, 0]
+        owner[wrong] = sides.own(means[wrong], now[wrong])
+        burnt = sides.ash[now].nonzero()[:, 0]
+        near = sides.burnt(means[burnt], now[burnt])
         self._faces = dataclasses.replace(
             faces,
             region=faces.region.index_copy(0, stale, now),
             owner=faces.owner.index_copy(0, stale, owner),
-            ash=faces.ash.index_copy(0, burnt, near),
+            ash=faces.ash.index_copy(0, stale[burnt], near),
         )
-
-    def _nearest(self, places: Tensor, region: Tensor, rows: Tensor) -> Tensor:
-        """Nearest of some rows of each place's region; of all where there is none."""
-        rest, spacing = self.base.matter.rest, self.base.matter.spacing[int(self._body[rows[0]])]
-        near = nearest_in_group(rest[rows], self._chunk[rows], places, region, 1, spacing)[1][:, 0]
-        lost = (near < 0).nonzero()[:, 0]
-        if lost.numel():
-            near[lost] = nearest_rows(rest[rows], places[lost], 1, spacing)[1][:, 0]
-        return rows[near]
 
     # --- motion ---
 

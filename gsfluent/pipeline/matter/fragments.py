@@ -94,6 +94,29 @@ def components(a: Tensor, b: Tensor, count: int) -> Tensor:
     return root
 
 
+def ranked(unit: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
+    """Pieces of some points by size, then by place, whatever the order of the points.
+
+    Args:
+        unit: What each hangs together with, int64 [P].
+        rest: Where they are at rest [m], [P, 3].
+
+    Returns:
+        The values of ``unit`` in that order, int64 [F], and the rank of each point's, int64 [P].
+    """
+    ids, index = torch.unique(unit, return_inverse=True)
+    low = torch.full((len(ids), 3), torch.inf, dtype=torch.float64, device=unit.device)
+    low.scatter_reduce_(0, index[:, None].expand(-1, 3), rest.double(), "amin")
+    x, y, z = low.unbind(dim=1)
+    order = torch.arange(len(ids), device=unit.device)
+    size = torch.bincount(index, minlength=len(ids))
+    for key in (z, y, x, -size):  # the last counts most
+        order = order[torch.argsort(key[order], stable=True)]
+    rank = torch.empty_like(order)
+    rank[order] = torch.arange(len(ids), device=unit.device)
+    return ids[order], rank[index]
+
+
 _SHARES = 2.0**40
 
 

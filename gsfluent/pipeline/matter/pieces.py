@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.blade import cut_apart
-from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, components, weigh
+from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, components, ranked, weigh
 from gsfluent.spatial.neighbours import nearest_rows
 
 LEAST = 64
@@ -85,6 +85,18 @@ class Web:
         body, part = self.body.cpu(), (mass / mass.sum()).cpu()
         share = torch.zeros(self.may_break.shape[0], dtype=torch.float64)
         return share.index_add_(0, body, part).to(mass.device)
+
+    @functools.cached_property
+    def amount(self) -> Tensor:
+        """Share of the whole mass that each point has, in whole numbers, int64 [N]."""
+        mass = self.mass.double()
+        return (mass / mass.sum() * _SHARES).round().long()
+
+    @functools.cached_property
+    def amounts(self) -> Tensor:
+        """The same of the bodies, int64 [bodies]."""
+        total = torch.zeros_like(self.may_break, dtype=torch.int64)
+        return total.index_add_(0, self.body, self.amount)
 
     def check(self) -> None:
         """Raise a ValueError where a shape does not match or a link names no point."""
@@ -182,12 +194,12 @@ def find_pieces(
     here = split[body]
     holds = ~cut & here[a] & (ratio < TORN)
     whole = here & ~broken & ~web.flowing
-    joined = ~cut & here[a] & whole[a] & whole[b]
+    joined = (~cut & here[a] & whole[a] & whole[b]).nonzero()[:, 0]
     root = components(a[joined], b[joined], count)
     enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
-    fresh = whole if ever is None else whole & ~ever
+    fresh = (whole if ever is None else whole & ~ever).nonzero()[:, 0]
     seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
-    name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], rows[fresh], "amin")
+    name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], fresh, "amin")
     unit = torch.where(seed, name[root], torch.where(here, DEBRIS, unit))
     unit = _nearest_seed(web, unit, seed, here & ~seed, holds, ratio, length)
 
@@ -196,7 +208,7 @@ def find_pieces(
     chip = torch.zeros_like(lost)
     bits = chip
     if bool(lost.any()):
-        joined = holds & lost[a] & lost[b]
+        joined = (holds & lost[a] & lost[b]).nonzero()[:, 0]
         root = components(a[joined], b[joined], count)
         members = torch.bincount(root, minlength=count)[root]
         lump = lost & (members >= enough)
@@ -253,21 +265,9 @@ def _length(a: Tensor, b: Tensor) -> Tensor:
 
 def _ranks(web: Web, unit: Tensor, seed: Tensor) -> tuple[Tensor, Tensor]:
     """Seeds by size, then place: their labels int64 [S] in that order, and the rank of each [N]."""
-    ids, index = torch.unique(unit[seed], return_inverse=True)
-    keys = []
-    for axis in (2, 1, 0):
-        at = web.rest[seed, axis].double()
-        low = torch.full((ids.shape[0],), torch.inf, dtype=at.dtype, device=at.device)
-        keys.append(low.scatter_reduce(0, index, at, "amin"))
-    keys.append(-torch.bincount(index, minlength=ids.shape[0]).double())
-    order = torch.arange(ids.shape[0], device=ids.device)
-    for key in keys:  # the last counts most
-        order = order[torch.argsort(key[order], stable=True)]
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(ids.shape[0], device=ids.device)
-    of_point = torch.zeros_like(unit)
-    of_point[seed] = rank[index]
-    return ids[order], of_point
+    rows = seed.nonzero()[:, 0]
+    ids, rank = ranked(unit[rows], web.rest[rows])
+    return ids, torch.zeros_like(unit).index_copy(0, rows, rank)
 
 
 def _nearest_seed(
@@ -285,14 +285,15 @@ def _nearest_seed(
     key = torch.where(seed, rank, _FAR)
     a, b = web.links.unbind(dim=1)
     # Nothing is shorter than nothing: no link leads into a seed.
-    there, back = holds & other[b], holds & other[a]
+    there, back = ((holds & other[end]).nonzero()[:, 0] for end in (b, a))
     source, target = torch.cat([a[there], b[back]]), torch.cat([b[there], a[back]])
-    price = length / web.spacing[web.body[a]] * (1.0 + _STEEP * (ratio - 1.0).clamp(0.0, 2.0))
-    steps = (price * _COST).round().long().clamp(min=1) << _RANKS
-    step = torch.cat([steps[there], steps[back]])
+    link = torch.cat([there, back])
+    price = length[link] / web.spacing[web.body[source]]
+    price = price * (1.0 + _STEEP * (ratio[link] - 1.0).clamp(0.0, 2.0))
+    step = (price * _COST).round().long().clamp(min=1) << _RANKS
     fresh = seed
     while True:
-        live = fresh[source]
+        live = fresh[source].nonzero()[:, 0]
         before = key
         key = before.scatter_reduce(
             0, target[live], before[source[live]] + step[live], "amin", include_self=True
@@ -345,11 +346,7 @@ def _surplus(
     gone: Tensor | None,
 ) -> Tensor:  # fmt: skip
     """Bits that are beyond the bound on dust, bool as ``rows``."""
-    bodies = web.may_break.shape[0]
-    whole = web.mass.double().sum()
-    share = (web.mass.double() / whole * _SHARES).round().long()
-    total = torch.zeros(bodies, dtype=torch.int64, device=rows.device)
-    total.index_add_(0, web.body, share)
+    share, total = web.amount, web.amounts
     members = torch.bincount(unit[solid], minlength=unit.shape[0])[unit.clamp(min=0)]
     members = torch.where(solid, members, 0)
     largest = torch.zeros_like(total).scatter_reduce(0, web.body, members, "amax")
@@ -392,21 +389,22 @@ def _moved(web: Web, unit: Tensor, position: Tensor, label: Tensor, places: Tens
     spacing = web.spacing[web.body[points]].double()
     scale = spacing[ends - count]  # of one body, of one spacing
 
-    def total(values: Tensor) -> Tensor:
-        """Sums by piece of values that are whole numbers when they are finer, int64."""
-        whole = (values * (_FINE / spacing)).round().long()
-        sums = torch.cumsum(whole, 0)[ends - 1]
-        return torch.diff(sums, prepend=torch.zeros_like(sums[:1]))
+    last = (torch.arange(9, device=points.device)[:, None] * len(points) + ends - 1).flatten()
+
+    def total(values: list[Tensor]) -> Tensor:
+        """Sums by piece of values [P] that are whole numbers when they are finer, int64 [S, K]."""
+        whole = (torch.stack(values) * (_FINE / spacing)).round().long().flatten()
+        # one running sum of one row: of several a GPU makes slow ones
+        sums = torch.cumsum(whole, 0)[last[: len(values) * len(names)]]
+        sums = torch.diff(sums, prepend=torch.zeros_like(sums[:1]))
+        return sums.view(len(values), -1).T
 
     arms, middles = [], []
     for x in (web.rest[points].double(), position[points].double()):
-        sums = torch.stack([total(x[:, axis]) for axis in range(3)], dim=1)
-        middle = sums.double() / count[:, None] * (scale / _FINE)[:, None]
+        middle = total(list(x.unbind(dim=1))).double() / count[:, None] * (scale / _FINE)[:, None]
         middles.append(middle)
-        arms.append(x - middle[slot])
-    square = torch.stack(
-        [total(arms[1][:, i] * arms[0][:, j] / spacing) for i in range(3) for j in range(3)], dim=1
-    )
+        arms.append((x - middle[slot]).unbind(dim=1))
+    square = total([arms[1][i] * arms[0][j] / spacing for i in range(3) for j in range(3)])
     u, _, vh = torch.linalg.svd(square.cpu().double().reshape(-1, 3, 3))
     turn = torch.ones(len(names), 1, 3, dtype=torch.float64)
     turn[:, 0, 2] = torch.sign(torch.linalg.det(u) * torch.linalg.det(vh))

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = room(
     chips="hashed hashes",
     mesh="PieceMesh Surfaces",
     roughness="amplitude",
+    splits="Split Splits",
     threshold="CHIP",
-    tree="Partition Split ranked",
+    tree="Partition",
 )

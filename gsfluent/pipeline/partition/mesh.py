@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsfluent.pipeline.matter.fragments import components
+from gsfluent.pipeline.partition.splits import Splits
 from gsfluent.pipeline.partition.tree import Partition
 
 OUTSIDE = -1
@@ -216,8 +217,10 @@ class Surfaces:
             far = split.face[at.unbind(dim=2)].double() + 1e-9 * partition.voxel
             share[rows] = far[:, 0] / far.sum(dim=1)
             slope = torch.zeros_like(normal[rows])
+            seen, of = Splits([split]), torch.zeros_like(label[:, 0])
             for end in (0, 1):
-                slope += split.slope(label[:, 0], at[:, end], partition.voxel)[1].double()
+                place = at[:, end] + low
+                slope += seen.slope(of, label[:, 0], place, partition.voxel)[1].double()
             normal[rows] = slope
         length = normal.norm(dim=1, keepdim=True)
         along = torch.nn.functional.one_hot(self._axis, 3).double()

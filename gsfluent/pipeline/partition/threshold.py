@@ -171,20 +171,22 @@ def keep_volumes(
     bar = torch.clamp(0.5 * VOLUME * wanted, min=1.0)
     width, best = 0.2, (math.inf, offset)
     gain, last = torch.full_like(offset, 0.6), torch.zeros_like(offset)
+    # of every pair: whom it belongs to, and whose faces it is near
+    names = torch.cat([a, b, a + count, b + count])
     for _ in range(_PASSES):
         now = _margin(lead, offset, a, b)
-        mine = torch.where(now >= 0, a, b)
-        volume = alone + torch.bincount(mine, minlength=count).cpu()
-        error = volume - wanted
+        band = now.abs() < width
+        told = torch.cat([now >= 0, now < 0, band, band]).long()
+        found = torch.zeros(2 * count, dtype=torch.int64, device=a.device)
+        volume, near = found.index_add_(0, names, told).cpu().view(2, count)
+        error = alone + volume - wanted
         worst = float((error.abs() / bar).amax())
         if worst < best[0]:
             best = worst, offset.clone()
         if worst <= 1.0:
             break
         # by how much a volume grows with its constant: voxels within a band about the faces
-        band = now.abs() < width
-        slope = torch.bincount(a[band], minlength=count) + torch.bincount(b[band], minlength=count)
-        slope = (slope.cpu().to(torch.float64) / (2.0 * width)).clamp(min=1.0)
+        slope = (near.to(torch.float64) / (2.0 * width)).clamp(min=1.0)
         # where the error has changed sign the step was too long
         gain = torch.where(error * last < 0.0, 0.6 * gain, (1.1 * gain).clamp(max=0.6))
         last = error

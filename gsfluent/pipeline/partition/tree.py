@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,13 +18,13 @@ from gsfluent import ops
 from gsfluent.data import Frame, Solid
 from gsfluent.geometry import trilinear
 from gsfluent.pipeline.partition.blur import box_width, reach
+from gsfluent.pipeline.partition.splits import Split
 from gsfluent.pipeline.partition.threshold import (
     CHIP,
     FAR,
     FIRST,
     SECOND,
     STAMP,
-    Labels,
     displaced,
     fields,
     join_islands,
@@ -42,53 +41,6 @@ PER_SPACING = 3.0
 MOST = {"cpu": 4_000_000, "cuda": 64_000_000}
 """Voxels of a body's box, at most; more would make coarser ones."""
 _RIM = 2  # point spacings around the body that have voxels
-
-
-class Split(NamedTuple):
-    """How one region was divided.
-
-    Attributes:
-        low: First voxel of the box that was touched.
-        ids: Regions, by the labels below: the old one, then the new ones.
-        labels: Labels in the box and the next ones, -1 outside of the region.
-        face: Distance from the nearest face, about [m], at most :data:`FAR` blurs, [X, Y, Z].
-        error: How far volumes are off, as shares of themselves, float64 [F].
-    """
-
-    low: tuple[int, int, int]
-    ids: tuple[int, ...]
-    labels: Labels
-    face: Tensor
-    error: Tensor
-
-    def signed(self, label: Tensor, voxel: Tensor) -> Tensor:
-        """Distance from a label's face [m], positive inside, at voxels of the box.
-
-        Args:
-            label: int64 [...].
-            voxel: Of the box, int64 [..., 3]; those outside of the region have nan.
-        """
-        shape = self.face.shape
-        size = torch.tensor(shape, device=voxel.device)
-        here = ((voxel >= 0) & (voxel < size)).all(dim=-1)
-        v = torch.minimum(voxel.clamp(min=0), size - 1)
-        flat = (v[..., 0] * shape[1] + v[..., 1]) * shape[2] + v[..., 2]
-        first, second = (part.reshape(-1)[flat].long() for part in self.labels[:2])
-        far = self.face.reshape(-1)[flat]
-        value = torch.where(first == label, far, -far)
-        # neither the first nor the second: deeper in foreign matter than that
-        value = torch.where((first != label) & (second != label), -2.0 * far, value)
-        return torch.where(here & (first >= 0), value, torch.nan)
-
-    def slope(self, label: Tensor, voxel: Tensor, edge: float) -> tuple[Tensor, Tensor]:
-        """:meth:`signed` [M] at voxels [M, 3] of the edge ``edge`` [m], and its gradient [M, 3]."""
-        one = torch.eye(3, dtype=torch.int64, device=voxel.device)
-        steps = torch.cat([torch.zeros_like(one[:1]), one, -one])  # a look at all costs less
-        around = self.signed(label, voxel + steps[:, None])
-        here, lone = around[0], around.isnan()
-        ahead, behind = torch.where(lone, here, around)[1:].view(2, 3, -1)
-        lone = lone[1:4] | lone[4:]
-        return here, ((ahead - behind) / torch.where(lone, edge, 2.0 * edge)).T.contiguous()
 
 
 class Partition:
@@ -212,7 +164,8 @@ class Partition:
         Args:
             region: Its number.
             points: Its points that are of a piece, at rest [m], [P, 3].
-            piece: Which one, int64 [P]; 0 the largest, and so on (:func:`ranked`).
+            piece: Which one, int64 [P]; 0 the largest, and so on
+                (:func:`~gsfluent.pipeline.matter.fragments.ranked`).
             ids: Regions by piece, the first one ``region`` itself.
             dust: The piece that is dust, single points; -1 for none.
 
@@ -309,27 +262,3 @@ class Partition:
         a, b, c = low.tolist()
         x, y, z = (high - low).tolist()
         return (a, b, c), (x, y, z)
-
-
-def ranked(unit: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
-    """Pieces of some points by size, then by place, whatever the order of the points.
-
-    Args:
-        unit: What each hangs together with, int64 [P].
-        rest: Where they are at rest [m], [P, 3].
-
-    Returns:
-        The values of ``unit`` in that order, int64 [F], and the rank of each point's, int64 [P].
-    """
-    ids, index = torch.unique(unit, return_inverse=True)
-    keys = []
-    for axis in (2, 1, 0):
-        low = torch.full((len(ids),), torch.inf, dtype=torch.float64, device=unit.device)
-        keys.append(low.scatter_reduce(0, index, rest[:, axis].double(), "amin"))
-    keys.append(-torch.bincount(index, minlength=len(ids)).double())
-    order = torch.arange(len(ids), device=unit.device)
-    for key in keys:  # the last counts most
-        order = order[torch.argsort(key[order], stable=True)]
-    rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(ids), device=unit.device)
-    return ids[order], rank[index]

@@ -189,6 +189,31 @@ def test_older_faces_do_not_change_and_a_run_can_be_taken_up(bound: Carry) -> No
     assert torch.equal(got.carry.owner, want.carry.owner)
 
 
+def test_regions_divided_at_once_are_as_if_divided_one_by_one(bound: Carry) -> None:
+    rest, spacing = bound.matter.rest, bound.matter.spacing[0]
+    first = halves(bound)
+    quarter = 2 * first + (rest[:, 1] > 0.0)
+    _, rank = torch.unique(quarter, return_inverse=True)
+    names = torch.stack([(rank == n).nonzero()[0, 0] for n in range(4)])
+    dust = (rest[:, 0].abs() < spacing) & (rest[:, 2] > 0.0)
+    last = torch.where(dust, -1, names[rank])
+    history = Repair().begin(bound)
+    for unit in (first, last):
+        drawn(bound, history, moment(bound, unit, apart(bound, 0.02)))
+    state = history.state()
+    events = state["splits"]
+    assert [e["region"] for e in events] == [0, 0, 1]
+    assert all(int(e["dust"]) >= 0 for e in events[1:])
+    # with a frame for each, they are taken up one after another
+    alone = Repair().begin(bound)
+    alone.restore({**state, "splits": [{**e, "frame": n} for n, e in enumerate(events)]})
+    points = moment(bound, last, apart(bound, 0.03))
+    a, b = (drawn(bound, one, points) for one in (history, alone))
+    assert torch.equal(a.ids, b.ids) and a.added > 100
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(a.gaussians, name), getattr(b.gaussians, name)), name
+
+
 def test_crumbs_follow_what_is_firm(bound: Carry) -> None:
     """Points that fly off one by one take no splats with them; the body keeps its shape."""
     rest, spacing = bound.matter.rest, bound.matter.spacing[0]

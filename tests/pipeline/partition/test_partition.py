@@ -9,10 +9,11 @@ from partition_shapes import cube, points_of, slabs
 from gsfluent.data import Frame
 from gsfluent.geometry import trilinear
 from gsfluent.ops import nearest_labels
+from gsfluent.pipeline.matter.fragments import ranked
 from gsfluent.pipeline.partition.blur import blur, box_width
 from gsfluent.pipeline.partition.roughness import amplitude, displacement, displacements
 from gsfluent.pipeline.partition.threshold import ISLAND, Labels, join_islands
-from gsfluent.pipeline.partition.tree import Partition, ranked
+from gsfluent.pipeline.partition.tree import Partition
 
 
 def fresh(rest: torch.Tensor, spacing: float, rough: float = 0.15) -> Partition:

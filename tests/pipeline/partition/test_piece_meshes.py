@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from partition_shapes import EDGE, ball, cube, points_of
 
 from gsfluent.data import Frame, Solid
+from gsfluent.pipeline.matter.fragments import ranked
 from gsfluent.pipeline.partition.mesh import PieceMesh, Surfaces
-from gsfluent.pipeline.partition.tree import Partition, ranked
+from gsfluent.pipeline.partition.tree import Partition
 
 SHAPES = {"ball": ball(False), "shell": ball(True), "cube": cube()}
 
