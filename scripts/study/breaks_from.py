@@ -90,7 +90,8 @@ def table(rows: list[dict[str, Any]]) -> str:
             right[row["shape"]].add(row["preset"])
         ends = f"{row['low']:.3g}, {row['high']:.3g}" if row["high"] else f"{row['low']:.3g}, -"
         cells = [row["preset"], row["shape"], f"{found:.3g}" if found else "-", ends,
-                 f"{planned:.3g}", f"{ratio:.2f}" if found else "-", str(row["specimens"])]  # fmt: skip
+                 f"{planned:.3g}", f"{ratio:.2f}" if found else "-",
+                 str(row["specimens"])]  # fmt: skip
         lines.append(f"| {' | '.join(cells)} |")
     said = [
         f"{shape}: {len(names)} of {sum(r['shape'] == shape for r in rows)}"
