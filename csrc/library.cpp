@@ -118,6 +118,14 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("box_blur(Tensor indicator, int width, int times) -> Tensor");
   m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
 
+  // --- graph: links between points, what hangs together, the nearest seed along links ---
+  m.def(
+      "link_costs(Tensor links, Tensor length, Tensor spacing, Tensor position, Tensor broken, "
+      "Tensor flowing, Tensor may_break, Tensor? gone, Tensor before, float open, float torn, "
+      "float steep, float unit, int shift) -> (Tensor, Tensor, Tensor)");
+  m.def("components(Tensor links, int count, Tensor? apart, Tensor? inside) -> Tensor");
+  m.def("nearest_seeds(Tensor links, Tensor cost, Tensor key, Tensor other) -> Tensor");
+
   // --- shade: light per pixel, from what the rasterizer blended to display values ---
   m.def(
       "shade(Tensor image, Tensor alpha, Tensor depth, Tensor normal, Tensor? gloss, "

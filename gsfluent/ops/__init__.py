@@ -39,6 +39,7 @@ __getattr__, __dir__, __all__ = lazy(
             "nearest_labels",
             "value_noise",
         ),
+        "gsfluent.ops.graph": ("components", "link_costs", "nearest_seeds"),
         "gsfluent.ops.shade": ("shade",),
         "gsfluent.ops.losses": ("Photometric", "photometric_loss", "ssim"),
         "gsfluent.ops.adam": ("adam_step",),

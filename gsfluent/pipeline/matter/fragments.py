@@ -10,6 +10,8 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from gsfluent import ops
+
 LINK_RADIUS = 1.5
 """Points closer than this many mean spacings at rest are linked."""
 STRETCH_LIMIT = 2.0
@@ -72,9 +74,6 @@ def rest_links(
 def components(a: Tensor, b: Tensor, count: int) -> Tensor:
     """Connected components of a graph, on its device.
 
-    Roots are hooked onto smaller ones and paths halved until all points know their root (after
-    Shiloach and Vishkin 1982): a few rounds, each a few kernels.
-
     Args:
         a: One end of each link, int64 [L].
         b: The other end.
@@ -83,15 +82,7 @@ def components(a: Tensor, b: Tensor, count: int) -> Tensor:
     Returns:
         The smallest row of each point's component, int64 [count].
     """
-    root = torch.arange(count, device=a.device)
-    while a.numel():
-        root.scatter_reduce_(0, torch.maximum(a, b), torch.minimum(a, b), "amin")
-        while not torch.equal(further := root[root], root):
-            root = further
-        a, b = root[a], root[b]
-        open_ = a != b
-        a, b = a[open_], b[open_]
-    return root
+    return ops.components(torch.stack([a, b], dim=1), count)
 
 
 def ranked(unit: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,8 +20,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.ops.blade import cut_apart
-from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, components, ranked, weigh
+from gsfluent.ops.graph import FAR_KEY
+from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, ranked, weigh
 from gsfluent.spatial.neighbours import nearest_rows
 
 LEAST = 64
@@ -36,7 +38,6 @@ TORN = 2.0
 _STEEP = 4.0
 _COST = 1024.0  # of a link as long as the spacing, unstretched
 _RANKS = 24  # bits of a key that hold the rank of a seed
-_FAR = (1 << 62) - 1
 NEAR = 1.5
 """Point spacings from a piece's rigid motion within which a small bit belongs to it."""
 REACH = 3.0
@@ -76,6 +77,12 @@ class Web:
         """Length of each link at rest [m], float64 [L]."""
         a, b = self.links.unbind(dim=1)
         return _length(self.rest[a], self.rest[b])
+
+    @functools.cached_property
+    def fixed(self) -> Tensor:
+        """Links of points that do not flow, bool [L]."""
+        a, b = self.links.unbind(dim=1)
+        return ~(self.flowing[a] | self.flowing[b])
 
     @functools.cached_property
     def share(self) -> Tensor:
@@ -167,23 +174,20 @@ def find_pieces(
     body, count = web.body, web.body.shape[0]
     device = body.device
     a, b = web.links.unbind(dim=1)
-    fixed = ~(web.flowing[a] | web.flowing[b])
-    length = web.length
-    ratio = _length(position[a], position[b]) / length.clamp(min=1e-30)
-    open_ = ratio > torch.where(broken[a] | broken[b], OPEN, TORN)
-    cut = cut_links | (open_ & fixed & web.may_break[body[a]])
     if sides is not None:
-        cut = cut | (cut_apart(sides[a], sides[b]) & fixed)
-    if gone is not None:
-        cut = cut | gone[a] | gone[b]
+        cut_links = cut_links | (cut_apart(sides[a], sides[b]) & web.fixed)
+    cut, cost, ends = ops.link_costs(
+        web.links, web.length, web.spacing[body], position.double(), broken, web.flowing,
+        web.may_break[body], cut_links, gone, open=OPEN, torn=TORN, steep=_STEEP, unit=_COST,
+        shift=_RANKS,
+    )  # fmt: skip
 
     bodies = web.may_break.shape[0]
     rows = torch.arange(count, device=device)
     first = torch.full((bodies,), count, device=device).scatter_reduce(0, body, rows, "amin")
     size = torch.bincount(body, minlength=bodies)
     hurt = torch.zeros(bodies, dtype=torch.bool, device=device)
-    hurt[body[broken]] = True
-    hurt[body[a[cut]]] = True
+    hurt[body[(broken | ends).nonzero()[:, 0]]] = True
     split = hurt & web.may_break
     unit = first[body]
     if not bool(split.any()):
@@ -192,24 +196,21 @@ def find_pieces(
         return Pieces(weigh(labels, web.mass), unit, cut, none, none)
 
     here = split[body]
-    holds = ~cut & here[a] & (ratio < TORN)
     whole = here & ~broken & ~web.flowing
-    joined = (~cut & here[a] & whole[a] & whole[b]).nonzero()[:, 0]
-    root = components(a[joined], b[joined], count)
+    root = ops.components(web.links, count, apart=cut, inside=whole)
     enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
     fresh = (whole if ever is None else whole & ~ever).nonzero()[:, 0]
     seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
     name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], fresh, "amin")
     unit = torch.where(seed, name[root], torch.where(here, DEBRIS, unit))
-    unit = _nearest_seed(web, unit, seed, here & ~seed, holds, ratio, length)
+    unit = _nearest_seed(web, unit, seed, here & ~seed, cost)
 
     # What no seed reaches: lumps of broken matter are pieces all the same, smaller things are not.
     lost = here & (unit < 0) & ~web.flowing
     chip = torch.zeros_like(lost)
     bits = chip
     if bool(lost.any()):
-        joined = (holds & lost[a] & lost[b]).nonzero()[:, 0]
-        root = components(a[joined], b[joined], count)
+        root = ops.components(web.links, count, apart=cost <= 0, inside=lost)
         members = torch.bincount(root, minlength=count)[root]
         lump = lost & (members >= enough)
         chip = lost & ~lump & (members >= CHIP)
@@ -221,7 +222,7 @@ def find_pieces(
     if bool(bits.any()):
         unit = _join(web, unit, position, solid, bits, gone, sides)
         solid = (unit >= 0) & ~chip & ~web.flowing
-    cut = cut | ((unit[a] != unit[b]) & fixed & here[a])
+    cut = cut | ((unit[a] != unit[b]) & web.fixed & here[a])
     labels = torch.where(solid, unit, DEBRIS)
     return Pieces(weigh(labels, web.mass), unit, cut, lost & (unit < 0), chip)
 
@@ -263,45 +264,18 @@ def _length(a: Tensor, b: Tensor) -> Tensor:
     return (x * x + y * y + z * z).sqrt()
 
 
-def _ranks(web: Web, unit: Tensor, seed: Tensor) -> tuple[Tensor, Tensor]:
-    """Seeds by size, then place: their labels int64 [S] in that order, and the rank of each [N]."""
-    rows = seed.nonzero()[:, 0]
-    ids, rank = ranked(unit[rows], web.rest[rows])
-    return ids, torch.zeros_like(unit).index_copy(0, rows, rank)
-
-
-def _nearest_seed(
-    web: Web, unit: Tensor, seed: Tensor, other: Tensor, holds: Tensor, ratio: Tensor,
-    length: Tensor,
-) -> Tensor:  # fmt: skip
+def _nearest_seed(web: Web, unit: Tensor, seed: Tensor, other: Tensor, cost: Tensor) -> Tensor:
     """Units in which every other point that a seed reaches has that seed's; the rest as it was.
 
-    Shortest paths by relaxation until nothing changes (Bellman 1958). What costs the same goes to
-    the larger seed.
+    What costs the same goes to the larger seed.
     """
-    if not bool(seed.any()):
+    rows = seed.nonzero()[:, 0]
+    if rows.numel() == 0:
         return unit
-    ids, rank = _ranks(web, unit, seed)
-    key = torch.where(seed, rank, _FAR)
-    a, b = web.links.unbind(dim=1)
-    # Nothing is shorter than nothing: no link leads into a seed.
-    there, back = ((holds & other[end]).nonzero()[:, 0] for end in (b, a))
-    source, target = torch.cat([a[there], b[back]]), torch.cat([b[there], a[back]])
-    link = torch.cat([there, back])
-    price = length[link] / web.spacing[web.body[source]]
-    price = price * (1.0 + _STEEP * (ratio[link] - 1.0).clamp(0.0, 2.0))
-    step = (price * _COST).round().long().clamp(min=1) << _RANKS
-    fresh = seed
-    while True:
-        live = fresh[source].nonzero()[:, 0]
-        before = key
-        key = before.scatter_reduce(
-            0, target[live], before[source[live]] + step[live], "amin", include_self=True
-        )
-        fresh = key != before
-        if not bool(fresh.any()):
-            break
-    reached = other & (key < _FAR)
+    ids, rank = ranked(unit[rows], web.rest[rows])
+    key = torch.full_like(unit, FAR_KEY).index_copy(0, rows, rank)
+    key = ops.nearest_seeds(web.links, cost, key, other)
+    reached = other & (key < FAR_KEY)
     return torch.where(reached, ids[(key & ((1 << _RANKS) - 1)).clamp(max=len(ids) - 1)], unit)
 
 
