@@ -323,7 +323,7 @@ def _mean_ratio(ratios: list[float]) -> float:
         return 1.0
     weights = [FORGET**age for age in reversed(range(len(ratios)))]
     logs = sum(weight * math.log(r) for weight, r in zip(weights, ratios, strict=True))
-    mean = logs / (sum(weights) + PRIOR * weights[0])
+    mean = logs / sum(weights) * len(ratios) / (len(ratios) + PRIOR)
     return min(max(math.exp(mean), CORRECTION[0]), CORRECTION[1])
 
 
