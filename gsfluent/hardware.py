@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import platform
+import time
 from pathlib import Path
 
 
@@ -52,3 +54,40 @@ def bound_memory(part: float) -> None:
         total = float(torch.cuda.get_device_properties(0).total_memory)
         tensors = max(part - CONTEXT / total, 0.5 * part)
         torch.cuda.set_per_process_memory_fraction(tensors, 0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Load:
+    """What the processors have done up to a moment [s]; nothing where the system does not say."""
+
+    at: float
+    busy: float | None  # CPU seconds of all processes of the machine
+    own: float  # Of this one and of those that it has waited for
+
+    @classmethod
+    def now(cls) -> Load:
+        """Of this moment."""
+        own = sum(os.times()[:4])
+        try:
+            words = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()
+            user, nice, system, _, _, irq, soft, stolen = (float(word) for word in words[1:9])
+        except (OSError, ValueError):
+            return cls(time.perf_counter(), None, own)
+        busy = (user + nice + system + irq + soft + stolen) / os.sysconf("SC_CLK_TCK")
+        return cls(time.perf_counter(), busy, own)
+
+    def crowded_since(self, now: Load | None = None) -> bool:
+        """Whether others have left this process too few processors since then.
+
+        Args:
+            now: The end of that time; this moment if absent.
+        """
+        import torch
+
+        now = now or Load.now()
+        took = now.at - self.at
+        if self.busy is None or now.busy is None or took <= 0.0:
+            return False
+        others = max(now.busy - self.busy - (now.own - self.own), 0.0) / took
+        cores = os.cpu_count() or 1
+        return cores - others < 0.9 * min(torch.get_num_threads(), cores)

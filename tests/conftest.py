@@ -49,6 +49,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
+def _one_glance() -> Iterator[None]:
+    """The look at a new machine, which the first run into each cache takes, once and not thrice."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gsfluent.plan.quick._TRIES", 1)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
 def _small_cuts() -> Iterator[None]:
     """The four cuts that every textured solid leaves, in few pixels: 1 s of work each time else."""
     with pytest.MonkeyPatch.context() as patch:

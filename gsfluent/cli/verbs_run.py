@@ -23,6 +23,7 @@ class Run(Verb):
       gsfluent run shot.yaml -o out --json     # run.json on stdout
       gsfluent run vase.glb -o out             # a mesh, dropped; also a splat.ply or a capture
       gsfluent run vase.glb -o out --material glass
+      gsfluent run PHOTOS -o out               # photographs or a video without poses (extra poses)
       gsfluent run MODEL --config c.json -o out     # a PhysGaussian model folder and its config
 
     Without a shot one is made, which breaks the object on the floor, and is written to
@@ -35,7 +36,7 @@ class Run(Verb):
     """
 
     shot: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="INPUT")]
-    """The shot file; or a mesh, a splat or a folder; or with --config a model folder of INRIA's."""
+    """The shot file; or a mesh, a splat, a video or a folder; with --config a model of INRIA's."""
     out: Out
     """Folder for the results; made when missing."""
     material: str | None = None
@@ -63,7 +64,7 @@ class Run(Verb):
             if path.suffix.lower() not in (".yaml", ".yml"):
                 from gsfluent.run.from_input import made_shot
 
-                path = made_shot(path, self.out, self.material)
+                path = made_shot(path, self.out, self.material, self._posed)
             elif self.material is not None:
                 raise InputError(
                     "--material does nothing with a shot", "write it there: objects: NAME: material"
@@ -88,6 +89,14 @@ class Run(Verb):
                 shot, self.out, device=device, seed=self.seed, force=self.force, reporter=report,
                 facts=facts, unlock=self.unlock,
             )  # fmt: skip
+
+    def _posed(self, photographs: Path) -> Path:
+        """The capture of photographs without poses."""
+        from gsfluent.results.lock import locked
+        from gsfluent.run.photographs import posed
+
+        with locked(self.out, unlock=self.unlock), self.progress("poses") as progress:
+            return posed(photographs, self.out, self.seed, progress)
 
     def text(self, result: dict[str, Any]) -> str | None:
         """How it ended; of a shot that was only written, all of it."""

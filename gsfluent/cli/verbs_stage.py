@@ -274,7 +274,7 @@ class Poses(Verb):
 
     def execute(self) -> dict[str, Any]:
         """Pose and write."""
-        from gsfluent.posing.colmap import find_poses
+        from gsfluent.posing import find_poses
 
         existing(self.photographs, "PHOTOS")
         with self.progress("poses") as progress:
@@ -284,10 +284,9 @@ class Poses(Verb):
 
     def text(self, result: dict[str, Any]) -> str | None:
         """What a person reads."""
-        lines = [
-            f"{result['registered']} of {result['images']} photographs have poses, "
-            f"{result['points']} points, reprojection error {result['reprojection_error']:.2f} px"
-        ]
+        from gsfluent.posing import poses_text
+
+        lines = [poses_text(result)]
         if result["missing"]:
             lines.append(f"without: {', '.join(result['missing'][:10])}")
         lines += result["advice"]

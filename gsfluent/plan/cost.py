@@ -36,6 +36,8 @@ LAW_SETS = ("elastic", "nacc", "general")
 """Sets of laws for which the solver has kernels of their own."""
 REMEMBERED = 8
 """Ratios of finished runs that a correction is made of, per stage."""
+FORGET = 0.8
+"""Weight of a run beside that of the run after it: what a machine was once does not stay."""
 PRIOR = 0.5
 """Weight of the probe among them, in runs: one run alone is believed by two thirds."""
 CORRECTION = (0.25, 4.0)
@@ -192,10 +194,19 @@ class CostModel:
 
     # --- learning ---
 
-    def learn(self, name: str, predicted: Cost, actual: Cost) -> None:
-        """Take over what a stage has cost, beside the prediction for that work, uncorrected."""
+    def learn(self, name: str, predicted: Cost, actual: Cost, *, crowded: bool = False) -> None:
+        """Take over what a stage has cost, beside the prediction for that work, uncorrected.
+
+        Args:
+            name: The stage.
+            predicted: By this model, uncorrected.
+            actual: What it took.
+            crowded: Whether others took the processors meanwhile: that it was slower than known
+                says nothing then.
+        """
+        slow = crowded and actual.seconds > predicted.seconds * self.correction(name)
         for store, said, took in (
-            (self.ratios, predicted.seconds, actual.seconds),
+            (self.ratios, predicted.seconds, 0.0 if slow else actual.seconds),
             (self.memory_ratios, float(predicted.bytes), float(actual.bytes)),
         ):
             if said > 0.0 and took > 0.0 and math.isfinite(took / said):
@@ -310,7 +321,9 @@ def _mean_ratio(ratios: list[float]) -> float:
     """Geometric mean with a weight for 1, bounded."""
     if not ratios:
         return 1.0
-    mean = sum(math.log(ratio) for ratio in ratios) / (len(ratios) + PRIOR)
+    weights = [FORGET**age for age in reversed(range(len(ratios)))]
+    logs = sum(weight * math.log(r) for weight, r in zip(weights, ratios, strict=True))
+    mean = logs / sum(weights) * len(ratios) / (len(ratios) + PRIOR)
     return min(max(math.exp(mean), CORRECTION[0]), CORRECTION[1])
 
 

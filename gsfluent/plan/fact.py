@@ -265,8 +265,18 @@ def learn(
     values: Mapping[str, Any],
     device: torch.device | str,
     folder: Path | None = None,
+    *,
+    crowded: bool = False,
 ) -> CostModel:
     """Correct the stored model of a device by a finished run; without one, the run makes the first.
+
+    Args:
+        model: With which it was planned; the stored one goes first.
+        plan: What was planned.
+        values: ``run.json``.
+        device: Where it ran.
+        folder: Of the stored model, the cache otherwise.
+        crowded: Whether others took the processors meanwhile.
 
     Returns:
         The corrected model, which has been stored.
@@ -280,7 +290,8 @@ def learn(
             model.seconds[name] = _costs(name, work[name], took["seconds"])
         elif name in model.seconds and plan["stages"][name]["seconds"] is not None:
             said = model.stage(name, work[name], corrected=False)
-            model.learn(name, said, Cost(took["seconds"], took["memory_bytes"]))
+            cost = Cost(took["seconds"], took["memory_bytes"])
+            model.learn(name, said, cost, crowded=crowded)
     try:
         if "simulate" in model.seconds:  # it is asked for the cells of a time budget
             model.save(device, folder)

@@ -1,8 +1,8 @@
 """The plan inside a run: made before it, judged and learned from after it.
 
-A run never measures the machine for its plan: without a calibration (``gsfluent plan`` makes one)
-the plan has no times and says so. Only a shot with a time budget, which cannot be run without,
-makes the probe run first. A plan that cannot be made costs no run.
+A first run takes a second's look at the machine for its plan (:mod:`gsfluent.plan.quick`). Only a
+shot with a time budget, which cannot be run without, makes the probe run first. A plan that cannot
+be made costs no run.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gsfluent.errors import InputError
+from gsfluent.hardware import Load
 from gsfluent.plan.cost import CostModel
 from gsfluent.plan.fact import compare, learn
 from gsfluent.results.store import content_digest, fingerprint
@@ -27,7 +30,8 @@ class Foresight:
     """A plan, and the model it was made with."""
 
     plan: dict[str, Any]  # From :func:`gsfluent.plan.plan.plan_shot`
-    model: CostModel | None  # None when this machine is not calibrated
+    model: CostModel | None  # None when nothing is known of this machine
+    began: Load  # How busy the machine was before
 
 
 def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
@@ -52,7 +56,7 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
     from gsfluent.plan.plan import plan_shot
 
     try:
-        model = CostModel.load(device)
+        model = CostModel.load(device) or _looked_at(device)
         made = plan_shot(shot, device=device, seed=context.seed, model=model)
     except Exception as error:  # a plan is advice: whatever is wrong, the run itself will say so
         _log.info("no plan: %s", str(error).splitlines()[0] if str(error) else type(error).__name__)
@@ -68,7 +72,19 @@ def foresee_run(context: RunContext, *, plan: bool = True) -> Foresight | None:
     section = {"calibrated": made["calibrated"], "predicted": predicted_of(made)}
     section |= {"binding": made["binding"], "warnings": made["warnings"]}
     context.record.values["plan"] = section | ({} if chosen is None else {"chosen": chosen})
-    return Foresight(made, model)
+    return Foresight(made, model, Load.now())
+
+
+def _looked_at(device: torch.device) -> CostModel | None:
+    """A first model of this machine, which is stored; None where none can be had in a second."""
+    from gsfluent.plan.quick import quick_model
+
+    model = quick_model(device)
+    if model is not None:
+        _log.info("this machine is new: a look of %.1f s says what work costs on it, roughly; "
+                  "runs teach it, gsfluent plan measures it", model.probe_seconds)  # fmt: skip
+        model.save(device)
+    return model
 
 
 def _in_words(plan: dict[str, Any]) -> str:
@@ -96,7 +112,8 @@ def judge_plan(context: RunContext, foreseen: Foresight | None) -> None:
     section = compare(foreseen.plan, values)
     values["plan"] = {**values["plan"], **section}
     try:
-        learn(foreseen.model, foreseen.plan, values, context.device)
+        crowded = foreseen.began.crowded_since()
+        learn(foreseen.model, foreseen.plan, values, context.device, crowded=crowded)
     except Exception as error:  # advice again: a finished run does not fail for it
         _log.info("the run taught the plan nothing: %s: %s", type(error).__name__, error)
     took, said = section["actual"]["seconds"], section["predicted"]["seconds"]

@@ -279,7 +279,7 @@ def rough_spacing(prospect: Prospect, model: CostModel, budget: float) -> float:
 def _about(model: CostModel) -> dict[str, Any]:
     """When a model was measured, and what runs have taught it."""
     return {
-        "measured": model.made or "by finished runs",
+        "measured": model.made or ("at a glance" if model.probe_seconds else "by finished runs"),
         "corrections": {name: model.correction(name) for name in model.ratios},
         "runs": max((len(ratios) for ratios in model.ratios.values()), default=0),
         "fit_errors": dict(model.errors),

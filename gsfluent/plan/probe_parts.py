@@ -44,18 +44,18 @@ def measure_solver(device: torch.device | str) -> tuple[dict[str, float], float]
     soft = materials.get("elastic").override(young_modulus=1e6)
     liquid = materials.get("water")
     samples = [
-        _measure(soft, 8, device),
-        _measure(soft, 16, device),
-        _measure(brittle, 8, device),
-        _measure(brittle, 14, device),
-        _measure(brittle, 17, device),
-        _measure(liquid, 12, device),
-        _measure(soft, 12, device, law_kernels=False),
-        _measure(brittle, 40, device, debris=True),
-        _measure(brittle, 10, device, two=True),
-        _measure(brittle, 13, device, two=True),
-        _measure(soft, 8, device, resident=False),
-        _measure(soft, 16, device, resident=False),
+        measured_ball(soft, 8, device),
+        measured_ball(soft, 16, device),
+        measured_ball(brittle, 8, device),
+        measured_ball(brittle, 14, device),
+        measured_ball(brittle, 17, device),
+        measured_ball(liquid, 12, device),
+        measured_ball(soft, 12, device, law_kernels=False),
+        measured_ball(brittle, 40, device, debris=True),
+        measured_ball(brittle, 10, device, two=True),
+        measured_ball(brittle, 13, device, two=True),
+        measured_ball(soft, 8, device, resident=False),
+        measured_ball(soft, 16, device, resident=False),
     ]
     features = [
         "steps", *(f"point_steps_{name}" for name in LAW_SETS), "block_steps",
@@ -64,7 +64,7 @@ def measure_solver(device: torch.device | str) -> tuple[dict[str, float], float]
     return fit(samples, features)
 
 
-def _measure(
+def measured_ball(
     material: Material,
     cells: int,
     device: torch.device | str,
@@ -74,7 +74,7 @@ def _measure(
     resident: bool = True,
     law_kernels: bool = True,
 ) -> Sample:
-    """Time some steps of a ball that strikes the floor, two that meet, or debris in flight."""
+    """Time 48 steps of a ball that strikes the floor, two that meet, or debris in flight."""
     radius = 0.1
     scene = Scene()
     for side in (-1.0, 1.0) if two else (0.0,):

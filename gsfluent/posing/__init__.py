@@ -2,4 +2,6 @@
 
 from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = room(__name__, colmap="find_poses")
+__getattr__, __dir__, __all__ = room(
+    __name__, colmap="LEAST find_poses photographs_in poses_text", frames="SUFFIXES"
+)

@@ -25,6 +25,8 @@ from gsfluent.progress import Progress, report_progress
 
 _log = logging.getLogger(__name__)
 
+LEAST = 3
+"""Photographs between which poses can be found."""
 _MAX_SIDE = 1600  # pixels at which features are sought; more costs time and finds hardly more
 _ALL_PAIRS = 200  # photographs up to which each is compared with each
 _LOOK = 1.0  # seconds between two looks at how far the work is
@@ -64,7 +66,7 @@ def find_poses(
         InputError: pycolmap or photographs are missing, or ``out`` holds a capture already.
         RunError: No two photographs could be related.
     """
-    colmap: Any = need("pycolmap", "poses", "gsfluent poses")
+    colmap: Any = need("pycolmap", "poses", "finding the poses of photographs")
     if (out / "sparse").exists() or (out / "images").exists():
         raise InputError(f"{out}: holds images or poses already", "name another folder for -o")
     video = photographs.is_file()
@@ -86,7 +88,7 @@ def find_poses(
         models = _map(colmap, work, len(found), one_camera=_one_size(found), seed=seed,
                       in_order=video, progress=progress)  # fmt: skip
         best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-        if best is None or best.num_reg_images() < 3:
+        if best is None or best.num_reg_images() < LEAST:
             raise RunError(f"{photographs}: no three of {len(found)} photographs fit together",
                            hint=_MENDS)  # fmt: skip
         (work / "sparse" / "0").mkdir(parents=True)
@@ -98,11 +100,24 @@ def find_poses(
     return report
 
 
-def _photographs(folder: Path) -> list[Path]:
+def photographs_in(folder: Path) -> list[Path]:
+    """The photographs of a folder, or of ``images/`` in it, by name."""
     place = folder / "images" if (folder / "images").is_dir() else folder
-    found = sorted(p for p in place.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
-    if len(found) < 3:
-        raise InputError(f"{place}: {len(found)} photographs", "three are the least, 40 are good")
+    return sorted(p for p in place.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def poses_text(report: dict[str, Any]) -> str:
+    """How many photographs have found their place, from what :func:`find_poses` returns."""
+    return (
+        f"{report['registered']} of {report['images']} photographs have poses, "
+        f"{report['points']} points, reprojection error {report['reprojection_error']:.2f} px"
+    )
+
+
+def _photographs(folder: Path) -> list[Path]:
+    found = photographs_in(folder)
+    if len(found) < LEAST:
+        raise InputError(f"{folder}: {len(found)} photographs", "three are the least, 40 are good")
     return found
 
 

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = room(
     carried="carry_to",
     demo="SIZES photograph_demo run_demo",
     from_input="made_shot",
+    photographs="posed",
     report="read_run write_report",
     shot="run_shot",
     single="fill_to reconstruct_to texture_to",

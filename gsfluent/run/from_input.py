@@ -11,6 +11,7 @@ import hashlib
 import logging
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,15 @@ from gsfluent.pipeline.capture.orient import (
 )
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.run.front import front_side
+from gsfluent.run.photographs import is_photographs
 from gsfluent.spatial.mesh_surface import surface_points
 from gsfluent.stages.breaking import SURE, breaks_from
 
 _log = logging.getLogger(__name__)
 
 FILE = "shot.yaml"
+PHOTOGRAPHS = "photographs"
+"""What :func:`find_input` calls photographs and videos whose poses are still to be found."""
 SETTINGS: dict[str, dict[str, Any]] = {"solve": {"quality": "preview"}, "output": {}}
 """How a shot that nobody has written is simulated and filmed."""
 
@@ -98,14 +102,21 @@ _INSIDE = {
 """Procedural insides by material; others continue the colours of the skin."""
 
 
-def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
+def made_shot(
+    source: Path,
+    out: Path,
+    material: str | None = None,
+    pose: Callable[[Path], Path] | None = None,
+) -> Path:
     """Write ``OUT/shot.yaml`` for a mesh, a splat or a folder, and say what was guessed.
 
     Args:
         source: A mesh, a splat, a capture, a model folder of the INRIA trainer, or a folder with
-            one of them in it.
+            one of them in it; photographs or a video, with ``pose``.
         out: Result folder of the run.
         material: Preset; guessed from name and colour without.
+        pose: Called with photographs that have no poses, returns their capture; without it they
+            are refused.
 
     Returns:
         The file.
@@ -116,6 +127,10 @@ def made_shot(source: Path, out: Path, material: str | None = None) -> Path:
     import yaml
 
     key, path = find_input(source)
+    if key == PHOTOGRAPHS:
+        if pose is None:
+            raise _no_poses(source)
+        key, path = "capture", pose(path)
     if material is None:
         material, why = guess_material(key, path, source)
         _log.info("material: %s, a guess from %s; --material NAME says better", material, why)
@@ -166,8 +181,15 @@ def _refuse_edited(target: Path) -> None:
     )
 
 
+def _no_poses(source: Path) -> InputError:
+    return InputError(
+        f"{source}: photographs without poses",
+        f"gsfluent run {source} -o out finds them; or: gsfluent poses {source} -o capture",
+    )
+
+
 def find_input(source: Path) -> tuple[str, Path]:
-    """Key of a shot and path for what a user pointed at.
+    """Key of a shot, or :data:`PHOTOGRAPHS`, and path for what a user pointed at.
 
     Raises:
         InputError: Nothing that a run can start from, or more than one thing.
@@ -181,10 +203,12 @@ def find_input(source: Path) -> tuple[str, Path]:
     kind = kind_of(source)
     if kind in ("mesh", "splats", "capture"):
         return kind, source
+    if source.is_file() and is_photographs(source):
+        return PHOTOGRAPHS, source
     if not source.is_dir():
         raise InputError(
             f"{source}: neither a shot, nor a mesh, a splat or a folder",
-            "give a shot.yaml, .obj, .glb, .stl, .ply, or the folder of a capture",
+            "give a shot.yaml, .obj, .glb, .stl, .ply, a video, or a folder of photographs",
         )
     if (source / "run.json").is_file():
         raise InputError(f"{source}: the result of a run", f"look at it: gsfluent view {source}")
@@ -200,9 +224,11 @@ def find_input(source: Path) -> tuple[str, Path]:
     if found:
         names = ", ".join(path.name for _, path in found[:5])
         raise InputError(f"{source}: holds more than one input ({names})", "name one of them")
+    if is_photographs(source):
+        return PHOTOGRAPHS, source
     raise InputError(
-        f"{source}: holds no capture, splat or mesh",
-        f"photographs need poses: gsfluent poses {source} -o capture, or give a transforms.json",
+        f"{source}: holds no capture, splat or mesh, and no three photographs",
+        "photographs need poses, which are found for three or more of one thing; 40 are good",
     )
 
 

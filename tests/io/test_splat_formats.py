@@ -194,6 +194,23 @@ def test_other_versions_say_what_reads_them(tmp_path: Path) -> None:
         load_splats(rewritten(tmp_path / "forty.sog", "meta.json", older))
 
 
+def test_a_sog_without_its_palette_loses_only_that(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = load_splats(FOREIGN / "forty.sog")
+    with (
+        zipfile.ZipFile(FOREIGN / "forty.sog") as old,
+        zipfile.ZipFile(tmp_path / "a.sog", "w") as new,
+    ):
+        for item in old.infolist():
+            if "shN" not in item.filename:
+                new.writestr(item, old.read(item))
+    plain = load_splats(tmp_path / "a.sog")
+    assert whole.sh.shape[1] == 4 and torch.equal(plain.sh, whole.sh[:, :1])
+    assert torch.equal(plain.means, whole.means)
+    assert "same from all sides" in caplog.text
+
+
 def test_a_spz_that_grows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSFLUENT_MAX_UNPACKED_BYTES", "1e6")
     stream = io.BytesIO()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from simulation_shapes import ellipsoid
 
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
+from gsfluent.hardware import Load
 from gsfluent.io.splats.load import save_splats
 from gsfluent.plan import probe as plan_probe
+from gsfluent.plan import quick
 from gsfluent.plan.cost import CostModel, machine_key
 from gsfluent.plan.fact import actual_work, compare, learn, seconds_left
 from gsfluent.plan.plan import cost_model, plan_shot
@@ -60,8 +63,9 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
 
 @pytest.fixture
 def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache with the made-up model in it."""
+    """A cache with the made-up model in it, on a machine where nobody else is at work."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(Load, "crowded_since", lambda self, now=None: False)
     model().save("cpu")
     return tmp_path
 
@@ -109,15 +113,40 @@ def test_a_run_says_what_was_planned_and_learns(shot: Shot, stored: Path) -> Non
     assert after is not None and after.ratios == taught.ratios
 
 
-def test_a_run_without_a_calibration_says_so_and_measures_nothing(
-    shot: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_first_run_looks_at_the_machine_and_never_probes_it(
+    shot: Shot,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
     def never(*_: Any) -> CostModel:
-        raise AssertionError("a run must not measure the machine")
+        raise AssertionError("a run must not probe the machine")
 
     monkeypatch.setattr(plan_probe, "calibrate", never)
+    caplog.set_level("INFO", "gsfluent")
+    section = run_shot(shot, tmp_path / "out")["plan"]
+    assert "this machine is new" in caplog.text and "plan: about " in caplog.text
+    assert section["calibrated"] and section["actual"]["seconds"] > 0.0
+    assert all(row["seconds"] > 0.0 for row in section["predicted"]["stages"].values())
+    # the model is kept, and the run has taught it; the probe is still to come
+    taught = CostModel.load("cpu")
+    assert taught is not None and not taught.measured and taught.memory_ratios
+    plan = plan_shot(shot, model=taught)
+    assert plan["calibrated"] and plan["model"]["measured"] == "at a glance"
+    with pytest.raises(AssertionError, match="must not probe"):
+        cost_model("cpu")  # who asks for the probe gets it
+    caplog.clear()
+    run_shot(shot, tmp_path / "again")
+    assert "this machine is new" not in caplog.text
+
+
+def test_a_run_where_nothing_can_be_had_in_a_second_teaches(
+    shot: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(quick, "quick_model", lambda device: None)  # as on a GPU
     section = run_shot(shot, tmp_path / "out")["plan"]
     assert section["calibrated"] is False
     assert section["predicted"]["seconds"] is None and section["actual"]["seconds"] > 0.0
@@ -129,8 +158,44 @@ def test_a_run_without_a_calibration_says_so_and_measures_nothing(
     assert plan["calibrated"] and plan["model"]["measured"] == "by finished runs"
     for name, took in section["actual"]["stages"].items():
         assert 0.2 < plan["stages"][name]["seconds"] / took["seconds"] < 5.0
-    with pytest.raises(AssertionError, match="must not measure"):
-        cost_model("cpu")  # who asks for the probe gets it
+
+
+def test_costs_of_the_reference_go_at_the_pace_of_this_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = json.loads(quick.REFERENCE.read_text(encoding="utf-8"))
+    assert set(known["seconds"]) == set(quick.STAGE_PIECES)
+    pace = {"solve": 2.0, "draw": 3.0, "arrays": 5.0}
+    here = {name: factor * known["pieces"][name] for name, factor in pace.items()}
+    monkeypatch.setattr(quick, "pieces", lambda: here)
+    made = quick.quick_model("cpu")
+    assert made is not None and not made.measured
+    for stage, piece in quick.STAGE_PIECES.items():
+        for feature, cost in known["seconds"][stage].items():
+            wanted = cost * pace["arrays" if feature == "start" else piece]
+            assert made.seconds[stage][feature] == pytest.approx(wanted)
+    assert quick.quick_model("cuda") is None
+
+
+def test_a_crowded_machine_teaches_nothing_slow(shot: Shot, tmp_path: Path) -> None:
+    stored = tmp_path
+    plan = plan_shot(shot, model=model())
+    values = run_shot(shot, stored / "out", plan=False)
+    for stage in values["stages"]:
+        stage["seconds"] = 1e3
+    taught = learn(model(), plan, values, "cpu", stored, crowded=True)
+    assert taught.ratios == {} and set(taught.memory_ratios) == set(plan["stages"])
+    for stage in values["stages"]:
+        stage["seconds"] = 1e-9
+    taught = learn(model(), plan, values, "cpu", stored, crowded=True)
+    assert set(taught.ratios) == set(plan["stages"])  # what is quick all the same counts
+    # others that leave fewer processors than this process has threads
+    then, cores = Load(0.0, 100.0, 5.0), os.cpu_count() or 1
+    assert not then.crowded_since(Load(10.0, 100.0 + 10.0, 5.0 + 10.0))
+    assert then.crowded_since(Load(10.0, 100.0 + 10.0 * cores, 5.0))
+    assert not Load(0.0, None, 5.0).crowded_since(Load(10.0, None, 5.0))
+    now = Load.now()
+    assert now.own > 0.0 and (now.busy is None or now.busy > 0.0)
 
 
 def test_a_stage_that_no_run_has_had_has_no_time(shot: Shot, stored: Path) -> None:

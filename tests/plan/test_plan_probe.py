@@ -16,7 +16,7 @@ from gsfluent.pipeline.capture.orient import look_at_point
 from gsfluent.plan import probe as plan_probe
 from gsfluent.plan.fit import Sample
 from gsfluent.plan.probe import draw_capture
-from gsfluent.plan.probe_parts import _STEPS, _measure, ball
+from gsfluent.plan.probe_parts import _STEPS, ball, measured_ball
 
 
 def test_the_drawn_photographs_fit_their_cameras(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_the_drawn_photographs_fit_their_cameras(tmp_path: Path) -> None:
 def test_steps_points_and_blocks_of_a_measurement_are_counted() -> None:
     soft = materials.get("elastic").override(young_modulus=1e6)
     for resident in (True, False):
-        features, seconds = _measure(soft, 6, "cpu", resident=resident)[1:]
+        features, seconds = measured_ball(soft, 6, "cpu", resident=resident)[1:]
         steps = features["steps"] + features["composed_steps"]
         assert _STEPS <= steps <= 1.5 * _STEPS and seconds > 0.0
         assert (features["composed_steps"] == 0.0) is resident
@@ -45,7 +45,7 @@ def test_steps_points_and_blocks_of_a_measurement_are_counted() -> None:
 
 def test_contact_is_seen_only_between_two() -> None:
     soft = materials.get("elastic").override(young_modulus=1e6)
-    alone, pair = (_measure(soft, 6, "cpu", two=two).features for two in (False, True))
+    alone, pair = (measured_ball(soft, 6, "cpu", two=two).features for two in (False, True))
     assert alone["contact_block_steps"] == 0.0 < pair["contact_block_steps"]
     assert pair["contact_block_steps"] <= pair["block_steps"]
 

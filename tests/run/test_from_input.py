@@ -56,7 +56,7 @@ def test_a_guess_says_that_it_is_one_and_what_is_near(
     assert "fruit.orange" in caplog.text and "--material" in caplog.text
 
 
-@pytest.mark.parametrize("material", ["plaster", "ceramic", "fruit.pumpkin", "rubber"])
+@pytest.mark.parametrize("material", ["plaster", "ceramic", "fruit.apple", "rubber"])
 def test_the_fall_breaks_what_can_break(tmp_path: Path, material: str) -> None:
     shot = load_shot(made_shot(mesh(tmp_path / "x.stl"), tmp_path / "out", material))
     drop = shot.events[0]

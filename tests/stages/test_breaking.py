@@ -19,12 +19,21 @@ def test_energy_pays_for_the_break() -> None:
     plaster = materials.plaster
     speed = breaks_from(plaster, 0.1)
     # of a larger body there is more matter behind every cut
-    assert breaks_from(plaster, 0.4) == pytest.approx(0.5 * speed, rel=0.1)
+    stiff = plaster.override(softening=1.0)  # its strength is reached long before
+    assert breaks_from(stiff, 0.4) == pytest.approx(0.5 * breaks_from(stiff, 0.1), rel=0.1)
     tough = plaster.override(fracture_energy=4.0 * plaster.fracture_energy)
     assert breaks_from(tough, 0.1) == pytest.approx(2.0 * speed, rel=0.1)
     # softened for the sake of the step it breaks at nearly the same speed
     hard = plaster.override(softening=1.0)
     assert breaks_from(hard, 0.1) == pytest.approx(speed, rel=0.3)
+
+
+def test_nothing_parts_below_its_strength() -> None:
+    apple = materials.get("fruit.apple")
+    small, large, huge = (breaks_from(apple, length) for length in (0.1, 0.6, 2.0))
+    assert small > large == huge  # the energy would be there for less
+    strong = apple.override(tensile_strength=2.0 * apple.tensile_strength)
+    assert breaks_from(strong, 2.0) == pytest.approx(2.0 * large, rel=1e-6)
 
 
 def test_what_holds_together_never_breaks_and_hand_made_softening_keeps_its_old_estimate() -> None:

@@ -9,6 +9,7 @@ components in 8 bits and in alpha which one is left out; ``shN_labels`` names a 
 from __future__ import annotations
 
 import json
+import logging
 import zipfile
 import zlib
 from pathlib import Path
@@ -24,6 +25,7 @@ from gsfluent.io.checked.limits import limit, unpacked_limit, within
 from gsfluent.io.checked.pictures import opened_image
 from gsfluent.io.splats.compressed import float_tensor
 
+_log = logging.getLogger(__name__)
 _AGAIN = "export it again, or convert it to .ply with splat-transform (npm)"
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _PALETTE_WIDTH = 64
@@ -80,7 +82,10 @@ def _decode(path: str | Path, meta: dict[str, Any], archive: zipfile.ZipFile) ->
         scales = np.exp(_book(meta["scales"])[pixels("scales")[:, :3]])
     color = pixels("sh0")
     sh = _book(meta["sh0"])[color[:, :3]][:, None]
-    if "shN" in meta:
+    if "shN" in meta and not {*meta["shN"]["files"]} <= {*archive.namelist()}:
+        _log.warning("%s: %s are not in it; colours are the same from all sides", path,
+                     " and ".join(map(str, meta["shN"]["files"])))  # fmt: skip
+    elif "shN" in meta:
         sh = np.concatenate([sh, _palette(meta["shN"], pixels)], axis=1)
     return Gaussians(
         means=float_tensor(means),

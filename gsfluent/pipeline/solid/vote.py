@@ -101,8 +101,9 @@ def vote_solid(known: Evidence, options: SolidOptions) -> Closed:
     deep = shell & (distance_transform(loose, gaussians.device) > _BURIED)
     if vote.open_side is not None:
         _log.info(
-            "fill: nothing seen from side %s; closed there (%.0f %% of inner voxels look out)",
-            vote.open_side,
+            "fill: nothing seen from side [%+.2f, %+.2f, %+.2f]; closed there "
+            "(%.0f %% of inner voxels look out)",
+            *vote.open_side,
             100 * vote.open_fraction,
         )
     notes = {

@@ -1,0 +1,88 @@
+"""A second's look at a machine: what work costs on a reference machine, at the pace of this one.
+
+The probe (:mod:`gsfluent.plan.probe`) measures every stage and takes a quarter of a minute, which
+nobody wants before a first film. Three short pieces of the real work say how fast a machine moves
+points, draws splats and goes through arrays; every cost of the reference goes with one of them.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gsfluent import materials
+from gsfluent.data import Camera, Gaussians
+from gsfluent.draw import draw
+from gsfluent.plan.cost import CostModel
+from gsfluent.plan.probe_parts import measured_ball
+from gsfluent.spatial import distance_transform
+
+REFERENCE = Path(__file__).with_name("reference.json")
+"""Costs that the probe has measured on one machine, and the pieces as that machine did them."""
+STAGE_PIECES = {
+    "reconstruct": "draw", "isolate": "arrays", "fill": "arrays", "texture": "arrays",
+    "simulate": "solve", "render": "draw", "export": "arrays",
+}  # fmt: skip
+"""Which piece of work a stage goes with; what is paid once goes with ``arrays`` everywhere."""
+_TRIES = 3  # the best of them counts: others at work make a piece slower, nothing makes it faster
+_CELLS = 12
+_SPLATS, _SIZE, _VOXELS, _NUMBERS = 30_000, (384, 288), 48, 300_000
+
+
+def quick_model(device: torch.device | str) -> CostModel | None:
+    """A model of this machine in a second or two; None on a GPU, of which there is no reference.
+
+    It counts as not measured: the probe is better, and finished runs correct it.
+    """
+    if torch.device(device).type != "cpu":
+        return None
+    known = json.loads(REFERENCE.read_text(encoding="utf-8"))
+    start = time.perf_counter()
+    here = pieces()
+    pace = {name: took / known["pieces"][name] for name, took in here.items()}
+    model = CostModel.unmeasured(device)
+    model.seconds = {
+        stage: {
+            feature: cost * pace["arrays" if feature == "start" else STAGE_PIECES[stage]]
+            for feature, cost in costs.items()
+        }
+        for stage, costs in known["seconds"].items()
+    }
+    model.probe_seconds = time.perf_counter() - start
+    return model
+
+
+def pieces() -> dict[str, float]:
+    """Seconds of three pieces of work on this CPU: ``solve``, ``draw`` and ``arrays``."""
+    brittle = materials.get("fruit.watermelon").override(variation=0.0)
+    generator = torch.Generator().manual_seed(0)
+    means = 0.5 * torch.randn(_SPLATS, 3, generator=generator)
+    splats = Gaussians.from_colors(means, torch.full((_SPLATS,), 0.01), means.abs().clamp(max=1.0))
+    width, height = _SIZE
+    camera = Camera.look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0), width=width, height=height)
+    numbers = torch.rand(_NUMBERS, generator=generator)
+    solid = (torch.rand(_VOXELS, _VOXELS, _VOXELS, generator=generator) < 0.999).numpy()
+
+    def arrays() -> None:
+        torch.sort(numbers)
+        distance_transform(solid)
+
+    return {
+        "solve": min(measured_ball(brittle, _CELLS, "cpu").seconds for _ in range(_TRIES)),
+        "draw": _best(lambda: draw(splats, camera)),
+        "arrays": _best(arrays),
+    }
+
+
+def _best(work: Callable[[], Any]) -> float:
+    found = []
+    for _ in range(_TRIES):
+        start = time.perf_counter()
+        work()
+        found.append(time.perf_counter() - start)
+    return min(found)
