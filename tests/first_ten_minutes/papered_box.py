@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from papered import blotted, rays_to
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 380.0
 HALF = np.array([0.30, 0.24, 0.20])
@@ -20,13 +21,7 @@ def eyes(count: int) -> np.ndarray:
 def photograph(eye: np.ndarray, papers: list[np.ndarray]) -> np.ndarray:
     """The box and the floor under it, looking at the middle of the box."""
     centre = np.array([0.0, 0.0, HALF[2]])
-    forward = (centre - eye) / np.linalg.norm(centre - eye)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    y, x = np.mgrid[0.5:HEIGHT, 0.5:WIDTH]
-    rays = forward + ((x - WIDTH / 2) / FOCAL)[..., None] * right
-    rays = rays + ((y - HEIGHT / 2) / FOCAL)[..., None] * down
+    rays = rays_to(eye, centre, (WIDTH, HEIGHT), FOCAL)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(centre + side * HALF - eye) / rays for side in (-1, 1)])
         near = ends.min(axis=0)
@@ -50,11 +45,7 @@ def papers() -> list[np.ndarray]:
     random = np.random.default_rng(0)
     made = []
     for which in range(4):
-        paper = np.zeros((480, 480), np.float32)
-        for size in (2.0, 4.0, 8.0):
-            noise = random.normal(size=(480, 480)).astype(np.float32)
-            blots = cv2.GaussianBlur(noise, (0, 0), size)
-            paper += blots / blots.std()
+        paper = blotted(random)
         tint = np.array([1, 1, 1] if which == 3 else [1.0, 0.45, 0.3], np.float32)
         made.append((128 + 40 * paper)[..., None] * tint)
     return made

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from papered import blotted, rays_to
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 VIEWS = 9
@@ -18,14 +19,7 @@ def eyes(count: int = VIEWS) -> np.ndarray:
 
 def photograph(eye: np.ndarray, walls: list[np.ndarray]) -> np.ndarray:
     """The corner of three papered walls, seen from inside, looking at (0.3, 0.3, 0.3)."""
-    forward = np.array([0.3, 0.3, 0.3]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    y, x = np.mgrid[0.5:HEIGHT, 0.5:WIDTH]
-    rays = forward + ((x - WIDTH / 2) / FOCAL)[..., None] * right
-    rays = rays + ((y - HEIGHT / 2) / FOCAL)[..., None] * down
+    rays = rays_to(eye, np.full(3, 0.3), (WIDTH, HEIGHT), FOCAL)
     with np.errstate(divide="ignore"):
         reach = np.where(rays < 0, -eye / rays, np.inf)  # to the three planes
     wall = reach.argmin(axis=-1)
@@ -41,13 +35,4 @@ def photograph(eye: np.ndarray, walls: list[np.ndarray]) -> np.ndarray:
 def walls() -> list[np.ndarray]:
     """Papers with blots of several sizes."""
     random = np.random.default_rng(0)
-    papers = []
-    for _ in range(3):
-        paper = np.zeros((480, 480), np.float32)
-        for size in (2.0, 4.0, 8.0):
-            blots = cv2.GaussianBlur(
-                random.normal(size=(480, 480)).astype(np.float32), (0, 0), size
-            )
-            paper += blots / blots.std()
-        papers.append(128 + 40 * paper)
-    return papers
+    return [128 + 40 * blotted(random) for _ in range(3)]

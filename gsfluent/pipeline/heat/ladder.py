@@ -46,18 +46,19 @@ def thermal_of(name: str, material: Material) -> Thermal:
             f"{name!r} has a temperature, but law {material.law!r} cannot melt",
             hint=f"use law {', '.join(SOFTENED)}, or leave out the temperature",
         )
-    if material.viscous:
-        raise InputError(
-            f"{name!r} has a temperature, but viscous matter cannot melt",
-            hint="leave out the temperature, or relaxation_share, relaxation_time and yield_time",
-        )
     try:
-        return thermal(material.name)
+        known = thermal(material.name)
     except InputError as error:
         raise InputError(
             f"{name!r} has a temperature, but nothing is known of the heat of {material.name!r}",
             hint=error.hint,
         ) from None
+    if material.viscous:
+        raise InputError(
+            f"{name!r} has a temperature, but viscous matter cannot melt",
+            hint="leave out the temperature, or relaxation_share, relaxation_time and yield_time",
+        )
+    return known
 
 
 def thawing(scene: Scene, matter: Matter) -> Matter:
