@@ -103,7 +103,7 @@ class ChunkCuts(NamedTuple):
 
 def find_faces(
     partition: Partition,
-    splits: Sequence[Split],
+    splits: Splits,
     solid: Solid,
     numbers: Sequence[int],
     relief: float = 0.0,
@@ -114,20 +114,20 @@ def find_faces(
 
     Args:
         partition: Of the body.
-        splits: What was done, to regions that none of the others touched; at least one.
+        splits: What was done, to regions that none of the others touched.
         solid: The body's solid, for the colours.
         numbers: Number of each split, which enters the keys.
         relief: How much higher white matter stands than black [m]: pores are pits.
     """
-    edge, seen = partition.voxel, Splits(splits)
-    sites = [_beside(partition, split) for split in splits]
+    edge, each = partition.voxel, splits.each
+    sites = [_beside(partition, split) for split in each]
     grid, other = (torch.cat(part) for part in zip(*sites, strict=True))
-    of = torch.arange(len(splits), device=grid.device).repeat_interleave(
+    of = torch.arange(len(each), device=grid.device).repeat_interleave(
         torch.tensor([len(site) for site, _ in sites], device=grid.device), output_size=len(grid)
     )
-    label, second = seen.labels(of, grid)
+    label, second = splits.labels(of, grid)
     beyond = torch.where((second >= 0) & (second != label), second, other)
-    far, gradient = seen.slope(of, label, grid, edge)
+    far, gradient = splits.slope(of, label, grid, edge)
     slope = gradient.norm(dim=1).clamp(min=_LEAST)
     normal = -gradient / slope[:, None]
     reach = (far / slope.clamp(min=0.2)).clamp(0.0, _STEP * edge)
@@ -139,7 +139,7 @@ def find_faces(
     matter, skin = _colors(partition, solid, center, below)
     crust = below < min(CRUST * partition.solid_voxel, edge)
     common = {
-        "voxel": flat, "region": seen.region(of, label), "beyond": seen.region(of, beyond),
+        "voxel": flat, "region": splits.region(of, label), "beyond": splits.region(of, beyond),
         "number": number,
     }  # fmt: skip
     spot = center + (reach - INSET * edge)[:, None] * normal
@@ -163,9 +163,7 @@ def find_faces(
         ).select(rim & (left > -edge))
     )  # fmt: skip
     made = ChunkFaces.joined(parts)
-    return (
-        made if len(splits) == 1 else made.select(torch.argsort(made.key >> _NUMBER, stable=True))
-    )
+    return made if len(each) == 1 else made.select(torch.argsort(made.key >> _NUMBER, stable=True))
 
 
 def _beside(partition: Partition, split: Split) -> tuple[Tensor, Tensor]:
@@ -273,13 +271,13 @@ def colors_at(partition: Partition, solid: Solid, means: Tensor) -> Tensor:
 
 
 def find_cuts(
-    partition: Partition, splits: Sequence[Split], splats: Gaussians, rows: Tensor, of: Tensor
+    partition: Partition, splits: Splits, splats: Gaussians, rows: Tensor, of: Tensor
 ) -> tuple[Tensor, ChunkCuts]:
     """Which splats are divided by splits.
 
     Args:
         partition: Of the body.
-        splits: What was done, to regions that none of the others touched; at least one.
+        splits: What was done, to regions that none of the others touched.
         splats: At rest.
         rows: Those of the regions that were split, int64 [M].
         of: Number of the split of each, int64 [M].
@@ -287,16 +285,16 @@ def find_cuts(
     Returns:
         The region of each row now, int64 [M], and the cuts; rivals are left to the caller (-1).
     """
-    edge, seen = partition.voxel, Splits(splits)
+    edge = partition.voxel
     place = partition.place(splats.means[rows])
     voxel = place.round().long()
-    label, second = seen.labels(of, voxel)
+    label, second = splits.labels(of, voxel)
     # a splat off the matter goes with the matter beside it
-    region = seen.region(of, label.clamp(min=0))
+    region = splits.region(of, label.clamp(min=0))
     found = (label >= 0).nonzero()[:, 0]
     of, label, second = of[found], label[found], second[found]
     voxel, place = voxel[found], place[found]
-    far, gradient = seen.slope(of, label, voxel, edge)
+    far, gradient = splits.slope(of, label, voxel, edge)
     far = far + (gradient * ((place - voxel) * edge).to(gradient)).sum(dim=1)
     slope = gradient.norm(dim=1).clamp(min=_LEAST)
     normal = -gradient / slope[:, None]
@@ -305,7 +303,7 @@ def find_cuts(
     root = root * splats.scales[rows[found], None]
     sigma = (normal[:, None] @ root)[:, 0].norm(dim=1)
     cut = (second >= 0) & (distance < REACH * sigma)
-    beyond = seen.region(of[cut], second[cut])
+    beyond = splits.region(of[cut], second[cut])
     return region, ChunkCuts(
         rows[found[cut]], beyond, normal[cut], distance[cut], torch.full_like(beyond, -1)
     )

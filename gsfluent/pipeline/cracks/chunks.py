@@ -39,7 +39,7 @@ from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude, relief
-from gsfluent.pipeline.partition.splits import Split
+from gsfluent.pipeline.partition.splits import Split, Splits
 from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
 from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
@@ -294,7 +294,8 @@ class Chunks:
         self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
         self._reassign(sides, partition)
         rows = sides.among(self._region)
-        here, cuts = find_cuts(partition, splits, splats, rows, sides.of[self._region[rows]])
+        seen, of = Splits(splits), sides.of[self._region[rows]]
+        here, cuts = find_cuts(partition, seen, splats, rows, of)
         self._region = self._region.index_copy(0, rows, here)
         owner, means = self._owner[rows], splats.means[rows]
         wrong = (self._chunk[owner] != here).nonzero()[:, 0]
@@ -302,7 +303,7 @@ class Chunks:
         self._owner = self._owner.index_copy(0, rows, owner)
         self._burn(rows[sides.ash[here]], sides)
         high = relief(self._scene.bodies[body].material.name)
-        made = find_faces(partition, splits, solid, numbers, high)
+        made = find_faces(partition, seen, solid, numbers, high)
         made = made.select(~sides.ash[made.region])
         cuts = wide_cuts(splats, rows, here, cuts, made, matter.spacing[body])
         cuts = ChunkCuts(*(part[~sides.ash[self._region[cuts.splat]]] for part in cuts))
@@ -378,7 +379,7 @@ class Chunks:
             its = self._scene.bodies[body]
             self._partitions[body] = Partition(
                 self._solid(body), body_frame(its, self._scene), self.base.matter.rest[a:b],
-                self.base.matter.spacing[body], body, amplitude(its.material.name),
+                self.base.matter.spacing[body], body, amplitude(its.material.name), keep=False,
             )  # fmt: skip
         return self._partitions[body]
 

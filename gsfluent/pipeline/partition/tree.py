@@ -41,6 +41,7 @@ PER_SPACING = 3.0
 MOST = {"cpu": 4_000_000, "cuda": 64_000_000}
 """Voxels of a body's box, at most; more would make coarser ones."""
 _RIM = 2  # point spacings around the body that have voxels
+_LAYERS = 64  # of voxels that have distances in double precision at once
 
 
 class Partition:
@@ -53,6 +54,8 @@ class Partition:
         spacing: Distance between them [m].
         root: Number of the region that it is at first.
         amplitude: Rms height of its crack faces, in spacings.
+        keep: Whether to remember what splits found in their voxels, as meshes need it, or only
+            their numbers.
 
     Attributes:
         voxel: Edge of a voxel [m].
@@ -62,8 +65,9 @@ class Partition:
     """
 
     def __init__(
-        self, solid: Solid, frame: Frame, rest: Tensor, spacing: float, root: int, amplitude: float
-    ) -> None:
+        self, solid: Solid, frame: Frame, rest: Tensor, spacing: float, root: int,
+        amplitude: float, *, keep: bool = True,
+    ) -> None:  # fmt: skip
         low, high = rest.double().amin(dim=0), rest.double().amax(dim=0)
         low, high = low - _RIM * spacing, high + _RIM * spacing
         device = rest.device
@@ -81,7 +85,7 @@ class Partition:
         self.origin = low
         self.shape = tuple(int(n) for n in (extent / self.voxel).ceil().long() + 1)
         self.splits: list[Split] = []
-        self._rest, self._solid, self._frame = rest, solid, frame
+        self._rest, self._solid, self._frame, self._keep = rest, solid, frame, keep
         self.region = ops.nearest_labels(
             self.place(rest), torch.zeros(len(rest), dtype=torch.int64, device=device),
             self.shape, self.per_spacing * STAMP,
@@ -215,12 +219,13 @@ class Partition:
         self._volumes.update(zip(ids, volume.tolist(), strict=True))
         sigma = SECOND * self.spacing
         # of a flat face: the difference of two blurred halves is an error function
-        far = torch.special.erfinv(labels.lead.clamp(0.0, 0.9995).double()) * (2.0**0.5 * sigma)
-        done = Split(
-            low, tuple(ids), labels, far.clamp(max=FAR * sigma).float(),
-            (volume.double() - wanted) / wanted.clamp(min=1.0),
-        )  # fmt: skip
-        self.splits.append(done)
+        far = torch.empty_like(labels.lead)
+        for lead, part in zip(labels.lead.split(_LAYERS), far.split(_LAYERS), strict=True):
+            value = torch.special.erfinv(lead.clamp(0.0, 0.9995).double()) * (2.0**0.5 * sigma)
+            part.copy_(value.clamp(max=FAR * sigma))
+        error = (volume.double() - wanted) / wanted.clamp(min=1.0)
+        done = Split(low, tuple(ids), labels, far, error)
+        self.splits.append(done if self._keep else done.numbers())
         return done
 
     def assign(

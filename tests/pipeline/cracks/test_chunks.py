@@ -15,7 +15,10 @@ from gsfluent.pipeline.cracks.chunks import OPACITY
 from gsfluent.pipeline.cracks.cuts import in_turns
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Points
-from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.matter.points import body_frame, build_matter
+from gsfluent.pipeline.partition.roughness import amplitude
+from gsfluent.pipeline.partition.splits import Splits
+from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.scene.scene import Scene
 
 
@@ -110,13 +113,19 @@ def test_pores_are_pits(bound: Carry) -> None:
     """Lightness is height: faces lean away from what is lighter, on the way up to it."""
     history = Repair().begin(bound)
     history.step(moment(bound, halves(bound), apart(bound, 0.1)))
-    partition = history._gaps._partitions[0]
-    solid = history._gaps._solid(0)
+    assert bound.scene is not None
+    (body,), (event,) = bound.scene.bodies, history.state()["splits"]
+    solid, rest = body.solid, bound.matter.rest
+    assert solid is not None
+    partition = Partition(
+        solid, body_frame(body, bound.scene), rest, bound.matter.spacing[0], 0, amplitude("apple")
+    )
+    split = partition.split(0, rest[event["rows"]], event["rank"].long(), [0, 1])
     z = solid.origin[2] + solid.voxel * (torch.arange(solid.depth.shape[2]) + 0.5)
     wave, white = 40.0, torch.ones(*solid.depth.shape, 3)
     striped = solid.replace(color=white * (0.5 + 0.3 * torch.sin(wave * z))[:, None])
     flat, plain, high = (
-        find_faces(partition, partition.splits[:1], one, [0], relief)
+        find_faces(partition, Splits([split]), one, [0], relief)
         for one, relief in ((solid, 0.0), (striped, 0.0), (striped, 0.03))
     )
     assert torch.equal(flat.normals, plain.normals) and torch.equal(flat.quats, plain.quats)
@@ -231,6 +240,8 @@ def test_regions_divided_at_once_are_as_if_divided_one_by_one(bound: Carry) -> N
     state = history.state()
     events = state["splits"]
     assert [e["region"] for e in events] == [0, 0, 1]
+    # nobody asks again what a split found in its voxels: a break of many pieces holds gigabytes
+    assert all(s.face.numel() == 0 for s in history._gaps._partitions[0].splits)
     assert all(int(e["dust"]) >= 0 for e in events[1:])
     # with a frame for each, they are taken up one after another
     alone = Repair().begin(bound)
