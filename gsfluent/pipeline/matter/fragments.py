@@ -111,18 +111,30 @@ def ranked(unit: Tensor, rest: Tensor) -> tuple[Tensor, Tensor]:
 _SHARES = 2.0**40
 
 
-def weigh(labels: Tensor, mass: Tensor) -> Fragments:
-    """The pieces of labelled points; masses are summed in whole numbers, which have no order.
+def mass_shares(mass: Tensor) -> Tensor:
+    """Shares of the whole mass in whole numbers, which have no order when they are summed.
+
+    Args:
+        mass: Masses [kg], [N].
+
+    Returns:
+        int64 [N]; they sum to about 2^40.
+    """
+    mass = mass.double()
+    return (mass / mass.sum() * _SHARES).round().long()
+
+
+def weigh(labels: Tensor, share: Tensor) -> Fragments:
+    """The pieces of labelled points.
 
     Args:
         labels: Piece of each point, [N]: a row, or -1 for none.
-        mass: Masses [kg], [N].
+        share: Of the mass (:func:`mass_shares`), int64 [N].
     """
-    share = (mass.double() / mass.double().sum() * _SHARES).round().long()
-    inside = labels >= 0
-    weight = torch.zeros_like(share).index_add_(0, labels[inside].long(), share[inside])
-    there = torch.zeros_like(inside)
-    there[labels[inside].long()] = True
+    rows = (labels >= 0).nonzero()[:, 0]
+    held = labels[rows].long()
+    weight = torch.zeros_like(share).index_add_(0, held, share[rows])
+    there = torch.zeros_like(labels, dtype=torch.bool).index_fill_(0, held, True)
     ids = there.nonzero()[:, 0].cpu()
     fractions = weight.cpu()[ids].double() / int(share.sum())
     order = torch.argsort(fractions, descending=True, stable=True)

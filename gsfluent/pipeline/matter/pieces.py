@@ -23,7 +23,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.ops.blade import cut_apart
 from gsfluent.ops.graph import FAR_KEY
-from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, ranked, weigh
+from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, mass_shares, ranked, weigh
 from gsfluent.spatial.neighbours import nearest_rows
 
 LEAST = 64
@@ -44,7 +44,6 @@ REACH = 3.0
 """Point spacings from a piece's points within which dust beyond the bound joins it: the reach of
 the kernel."""
 _FINE = 2.0**20
-_SHARES = 2.0**40
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +95,7 @@ class Web:
     @functools.cached_property
     def amount(self) -> Tensor:
         """Share of the whole mass that each point has, in whole numbers, int64 [N]."""
-        mass = self.mass.double()
-        return (mass / mass.sum() * _SHARES).round().long()
+        return mass_shares(self.mass)
 
     @functools.cached_property
     def amounts(self) -> Tensor:
@@ -193,7 +191,7 @@ def find_pieces(
     if not bool(split.any()):
         labels = torch.where(web.flowing, DEBRIS, unit)
         none = torch.zeros_like(broken)
-        return Pieces(weigh(labels, web.mass), unit, cut, none, none)
+        return Pieces(weigh(labels, web.amount), unit, cut, none, none)
 
     here = split[body]
     whole = here & ~broken & ~web.flowing
@@ -224,7 +222,7 @@ def find_pieces(
         solid = (unit >= 0) & ~chip & ~web.flowing
     cut = cut | ((unit[a] != unit[b]) & web.fixed & here[a])
     labels = torch.where(solid, unit, DEBRIS)
-    return Pieces(weigh(labels, web.mass), unit, cut, lost & (unit < 0), chip)
+    return Pieces(weigh(labels, web.amount), unit, cut, lost & (unit < 0), chip)
 
 
 def dust_limit(share: Tensor, points: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.pipeline.matter.fragments import components, rest_links, weigh
+from gsfluent.pipeline.matter.fragments import components, mass_shares, rest_links, weigh
 
 
 def test_links_join_neighbours_of_one_body_only():
@@ -35,7 +35,7 @@ def test_components_on_the_device_are_those_of_scipy() -> None:
 
 def test_pieces_are_ordered_by_mass_not_by_count() -> None:
     labels = torch.tensor([0, 0, 0, 0, -1, 5, 5])
-    pieces = weigh(labels, torch.tensor([1.0, 1, 1, 1, 1, 10, 10]))
+    pieces = weigh(labels, mass_shares(torch.tensor([1.0, 1, 1, 1, 1, 10, 10])))
     assert pieces.ids.tolist() == [5, 0] and pieces.labels.tolist() == labels.tolist()
     assert pieces.mass_fractions.tolist() == pytest.approx([0.8, 0.16])
     assert pieces.debris_fraction == pytest.approx(0.04) and pieces.largest == pytest.approx(0.8)
