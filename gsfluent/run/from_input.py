@@ -299,8 +299,8 @@ def _size(key: str, path: Path, splats: Gaussians | None) -> float:
 def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[float] | None, str]:
     """The direction towards who looks at the front of an input, and what it was guessed from.
 
-    Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, the
-    side with the most to see.
+    Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, what
+    :func:`gsfluent.run.front.front_side` chooses.
 
     Args:
         key: ``mesh``, ``splats`` or ``capture``.
@@ -330,10 +330,10 @@ def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[fl
     usual = -upright_rotation(up)[1]
     points = splats.means.double().numpy()
     colors = splats.colors().clamp(0.0, 1.0).double().numpy()
-    way, more = front_side(points, colors, up, usual)
-    if more == 1.0:
+    way, why = front_side(points, colors, up, usual)
+    if not why:
         return None, "that by the custom of its axes, since no side shows clearly more"
-    return _rounded(way), f"the side with the most to see ({more:.2g} times the usual front)"
+    return _rounded(way), why
 
 
 def _rounded(way: np.ndarray) -> list[float]:

@@ -16,6 +16,7 @@ from gsfluent.config import load_shot
 from gsfluent.errors import InputError
 from gsfluent.io import save_image
 from gsfluent.run.from_input import _fall, find_input, guess_front, made_shot
+from gsfluent.run.front import front_side
 from gsfluent.stages.breaking import breaks_from
 
 
@@ -138,6 +139,31 @@ def test_the_painted_side_is_the_front(tmp_path: Path, caplog: pytest.LogCapture
 def test_what_looks_alike_from_all_sides_keeps_the_custom(tmp_path: Path) -> None:
     assert front_of(mesh(tmp_path / "b.glb", (120, 75, 40))) is None
     assert front_of(painted(tmp_path / "c.glb", (0.0, 0.0, 1.0))) is None
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+def test_a_face_is_looked_at_along_the_plane_of_symmetry(turn: float) -> None:
+    """Cheeks are busier than the face, and the back is bare."""
+    ball = trimesh.creation.icosphere(5).vertices * [1.0, 1.2, 0.8]
+    cheek = (np.abs(ball[:, 0]) > 0.4) & (np.floor(9.0 * np.abs(ball)).sum(axis=1) % 2 == 0)
+    face = (ball[:, 2] > 0.4) & (np.abs(ball[:, 0]) < 0.2) & (np.abs(ball[:, 1]) < 0.2)
+    colors = np.where((cheek | face)[:, None], [0.9, 0.1, 0.1], [0.5, 0.5, 0.5])
+    nose = np.where(face[:, None], [0.0, 0.0, 0.3], [0.0, 0.0, 0.0])
+    cos, sin = math.cos(turn), math.sin(turn)
+    about = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+    up, usual = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    found, _ = front_side((ball + nose) @ about.T, colors, up, usual)
+    assert found @ about[:, 2] > math.cos(math.radians(10.0))
+
+
+def test_what_is_seen_end_on_is_not_the_front() -> None:
+    """A bar is alike left and right along itself, too, and its near end is painted."""
+    bar = trimesh.sample.sample_surface(trimesh.creation.box((2.0, 0.4, 0.5)), 4000, seed=0)[0]
+    end = (bar[:, 0] > 0.99) & (np.floor(20.0 * bar).sum(axis=1) % 2 == 0)
+    colors = np.where(end[:, None], [0.9, 0.1, 0.1], [0.5, 0.5, 0.5])
+    up, usual = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    found, why = front_side(bar, colors, up, usual)
+    assert abs(found @ usual) > 0.99, why
 
 
 @pytest.mark.parametrize("around", [False, True])
