@@ -186,7 +186,8 @@ class Reconstruct(Stage):
         trained = time.monotonic()
         if views[0].mask is not None:
             start = "visual hull"
-            gaussians = run.object_of(views, 0, self.iterations).labelled(SURFACE)
+            hull = agreed_hull(views)
+            gaussians = run.object_of(views, hull, 0, self.iterations).labelled(SURFACE)
         else:
             gaussians, start = run.scene_of(train_set, views), "sparse points"
         if gaussians.count == 0:
@@ -290,29 +291,38 @@ class _Run:
                 "the object shows in %d of %d views; not separated", len(masked), len(views)
             )
             return scene
-        found = self.object_of(masked, steps, stage.iterations - steps, scene, found)
+        try:
+            hull = agreed_hull(masked)
+        except InputError:  # these silhouettes are ours: nothing that a user gave is wrong
+            _log.warning(
+                "the silhouettes of the object have no common body; it stays as %d of %d steps "
+                "have it: more steps, larger photographs, or masks", steps, stage.iterations,
+            )  # fmt: skip
+            return Gaussians.cat([found.labelled(SURFACE), rest.labelled(BACKGROUND)])
+        found = self.object_of(masked, hull, steps, stage.iterations - steps, scene, found)
         rest, _ = seen_background(found, rest, views)
         return Gaussians.cat([found.labelled(SURFACE), rest.labelled(BACKGROUND)])
 
     def object_of(
         self,
         views: list[TrainView],
+        hull: Hull,
         before: int,
         steps: int,
         scene: Gaussians | None = None,
         found: Gaussians | None = None,
     ) -> Gaussians:
-        """Learn what the masks show, from the visual hull.
+        """Learn what the masks show, from their visual hull.
 
         Args:
             views: Masked, cropped views.
+            hull: Their visual hull.
             before: Steps done in earlier phases.
             steps: Steps of this one.
             scene: Result of the earlier phase, kept in checkpoints.
             found: The object as the earlier phase has it.
         """
         stage = self.stage
-        hull = agreed_hull(views)
         count = min(stage.start_gaussians, _HULL_START)
         # only the start: in training, Gaussians may be wherever the masks allow them
         body = hull

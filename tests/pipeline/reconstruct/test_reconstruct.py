@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import load_capture, save_image
 from gsfluent.pipeline.capture.hull import focus_point, visual_hull
-from gsfluent.pipeline.capture.views import halved, read_views
+from gsfluent.pipeline.capture.views import TrainView, halved, read_views
 from gsfluent.pipeline.reconstruct.init import hull_gaussians
 from gsfluent.pipeline.reconstruct.isolate import Isolate, find_plane
 from gsfluent.pipeline.reconstruct.masks import refined_mask
@@ -154,6 +155,33 @@ def test_object_is_learned_again_from_its_silhouettes_and_resumes(
     truth = demo.make_object("watermelon", 0)
     depth = truth.depth(found.means.double())
     assert float((depth > -0.01).double().mean()) > 0.9  # nothing of table or shadow
+
+
+def scattered(views: list[TrainView]) -> list[TrainView]:
+    """Masks of two corners in turn: no voxel is on all of them."""
+    made = []
+    for number, view in enumerate(views):
+        mask = torch.zeros(view.color.shape[:2])
+        mask[(slice(2, 6), slice(2, 6)) if number % 2 else (slice(-6, -2), slice(-6, -2))] = 1.0
+        made.append(replace(view, mask=mask))
+    return made
+
+
+def test_silhouettes_without_a_common_body_are_survived(
+    table: Capture, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Given masks that contradict each other are an error; those that were found are not."""
+    views = read_views(table, 64, torch.device("cpu"), crop=False)
+    with pytest.raises(InputError, match="no common object"):
+        visual_hull(scattered(views))
+    monkeypatch.setattr(
+        "gsfluent.pipeline.reconstruct.stage.object_views",
+        lambda views, found, rest: (scattered(views), {}),
+    )
+    gaussians = Reconstruct(iterations=100, image_size=64, start_gaussians=2000)(table)
+    assert "it stays as 60 of 100 steps have it" in caplog.text
+    assert gaussians.labels is not None
+    assert 0 < gaussians.report["object_gaussians"] < gaussians.count
 
 
 def test_mask_is_refined_by_the_photograph() -> None:
