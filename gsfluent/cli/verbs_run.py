@@ -57,6 +57,8 @@ class Run(Verb):
         from gsfluent.config import load_shot, refuse_programs
         from gsfluent.run.shot import run_shot
 
+        if self.out.exists() and not self.out.is_dir():
+            raise InputError(f"-o: {self.out} is a file", "give a folder; it is made when missing")
         if self.config is None:
             if self.write_shot:
                 raise InputError("--write-shot does nothing without --config", "drop it")

@@ -182,8 +182,19 @@ def read_parts(path: str | Path) -> list[trimesh.Trimesh]:
     except Exception as error:  # readers of many formats, each with errors of its own
         raise InputError(f"{path}: cannot be read as a mesh ({error})", _FORMATS) from error
     if not parts:
-        raise InputError(f"{path}: holds no triangles", "give a triangle mesh")
+        raise InputError(f"{path}: holds no triangles", _without_triangles(path))
     return parts
+
+
+def _without_triangles(path: Path) -> str:
+    """What to do about a mesh file that holds none."""
+    with open(path, "rb") as stream:
+        head = stream.read(4)
+    if not head:
+        return "the file is empty; copy or export it again"
+    if head[:3] == b"ply" and path.suffix.lower() != ".ply":
+        return f"it is a PLY file by its first line; rename it {path.stem}.ply"
+    return "give a triangle mesh"
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:

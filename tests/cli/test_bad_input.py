@@ -103,6 +103,31 @@ def test_truncated_splat(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "bad.ply" in refused(["fill", str(bad), "-o", str(tmp_path / "solid.ply")], capsys)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("empty.obj", b"", "the file is empty"),
+        ("empty.ply", b"", "it is empty"),
+        ("splat.obj", b"ply\nformat ascii 1.0\n", "rename it splat.ply"),
+    ],
+)
+def test_a_file_that_is_not_what_its_name_says(
+    name: str, content: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert main(["plan", str(tmp_path / name)]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_file_where_the_results_should_go(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "film.mp4").write_bytes(b"kept")
+    assert main(["run", str(ball), "-o", str(tmp_path / "film.mp4")]) == 2
+    assert "film.mp4 is a file" in capsys.readouterr().err
+    assert (tmp_path / "film.mp4").read_bytes() == b"kept"
+
+
 def test_wrong_key_names_the_nearest(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

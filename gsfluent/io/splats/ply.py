@@ -114,6 +114,8 @@ def _read_header(path: Path, stream: Any) -> tuple[str, list[_Element]]:
     """Parse up to ``end_header``; return the byte order and the elements."""
     hint = "check that the file is a complete .ply"
     if stream.readline(16).strip() != b"ply":
+        if path.stat().st_size == 0:
+            raise InputError(f"{path}: not a PLY file (it is empty)", "copy or export it again")
         raise InputError(
             f"{path}: not a PLY file (it does not begin with 'ply')", "pass a 3DGS .ply file"
         )
