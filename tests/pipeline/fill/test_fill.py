@@ -56,6 +56,20 @@ def _matrices(gaussians: Gaussians) -> torch.Tensor:
     return quaternion_to_matrix(gaussians.quats.double())
 
 
+def test_what_hangs_free_beside_the_rest_is_filled_too() -> None:
+    """Without matter it would be carried by the rest, and hover; a floater gets none."""
+    ball = ellipsoid_shell(3000, (1.0, 1.0, 1.0))
+    parts = [ball]
+    for size, place in ((0.36, 1.8), (0.12, -1.8)):
+        means = size * ball.means + torch.tensor([place, 0.0, 0.0])
+        parts.append(ball.replace(means=means, scales=size * ball.scales))
+    solid = Fill(48, match_masks=False)(Gaussians.cat(parts))
+    centers = solid.voxel * (solid.occupancy.nonzero() + 0.5) + solid.origin
+    hand, floater = centers[:, 0] > 1.3, centers[:, 0] < -1.3
+    assert float(hand.sum()) / float((~hand).sum()) == pytest.approx(0.36**3, rel=0.35)
+    assert not floater.any()
+
+
 def test_closed_shell_is_filled(solid: Solid) -> None:
     assert iou(solid.occupancy.numpy(), ellipsoid_truth(solid)) > 0.97
     report = solid.report
