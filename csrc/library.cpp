@@ -116,6 +116,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "nearest_in_cells(Tensor points, Tensor queries, Tensor order, Tensor start, Tensor keys, "
       "float[3] low, float cell, int count) -> (Tensor, Tensor)");
   m.def("box_blur(Tensor indicator, int width, int times) -> Tensor");
+  m.def("distance_transform(Tensor occupied, bool indices) -> (Tensor, Tensor)");
   m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
 
   // --- graph: links between points, what hangs together, the nearest seed along links ---

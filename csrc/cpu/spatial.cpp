@@ -102,6 +102,49 @@ struct SpatialCpu {
     });
   }
 
+  static void distance_pass(const DistanceArgs& a, const Scope&) {
+    const int64_t count = a.shape[a.axis];
+    if (a.axis == 2) {
+      parallel_for(a.voxels() / count, 64, [&](int64_t begin, int64_t end) {
+        for (int64_t line = begin; line < end; ++line) distances_along(a, line);
+      });
+      return;
+    }
+    // Lines that begin side by side go through memory together, a line of the cache at a time.
+    constexpr int64_t kSide = 16;
+    const int64_t row = a.axis == 0 ? a.shape[1] * a.shape[2] : a.shape[2];
+    const int64_t tiles = (row + kSide - 1) / kSide, stride = a.stride();
+    parallel_for(a.voxels() / count / row * tiles, 8, [&](int64_t begin, int64_t end) {
+      const bool named = a.next_source != nullptr;
+      std::vector<int32_t> held((named ? 5 : 3) * kSide * count);
+      int32_t* const square = held.data();
+      int32_t* const stack = square + kSide * count;
+      int32_t* const next = stack + kSide * count;
+      int32_t* const source = named ? next + kSide * count : nullptr;
+      int32_t* const named_next = named ? source + kSide * count : nullptr;
+      for (int64_t tile = begin; tile < end; ++tile) {
+        const int64_t column = tile % tiles * kSide, side = std::min(kSide, row - column);
+        const int64_t base = a.first(tile / tiles * row + column);
+        const auto each = [&](auto&& move) {
+          for (int64_t u = 0; u < count; ++u)
+            for (int64_t j = 0; j < side; ++j) move(base + u * stride + j, j * count + u);
+        };
+        each([&](int64_t there, int64_t here) {
+          square[here] = a.square[there];
+          if (named) source[here] = a.source[there];
+        });
+        for (int64_t j = 0; j < side; ++j)
+          envelope_along(int(count), 1, square + j * count, named ? source + j * count : nullptr,
+                         stack + j * count, next + j * count,
+                         named ? named_next + j * count : nullptr);
+        each([&](int64_t there, int64_t here) {
+          a.next_square[there] = next[here];
+          if (named) a.next_source[there] = named_next[here];
+        });
+      }
+    });
+  }
+
   static void value_noise(const ValueNoiseArgs& a, const Scope&) {
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::value_noise(a, i);

@@ -3,6 +3,7 @@
 
 #include <limits>
 
+#include "core/distance.h"
 #include "core/spatial.h"
 #include "torch_api.h"
 
@@ -121,6 +122,39 @@ struct SpatialOps {
     return grids[1 - turn];
   }
 
+  static std::tuple<Tensor, Tensor> distance_transform(Tensor occupied, bool indices) {
+    const char* op = "distance_transform";
+    occupied = ready(op, "occupied", occupied, occupied, {-1, -1, -1}, ScalarType::Bool);
+    const std::vector<int64_t> shape{occupied.size(0), occupied.size(1), occupied.size(2)};
+    check_grid(op, shape);
+    for (const int64_t n : shape)
+      STD_TORCH_CHECK(n <= kMostAlong, op, ": at most ", kMostAlong, " voxels along an axis, got ",
+                      n);
+    STD_TORCH_CHECK(shape[0] * shape[1] * shape[2] < std::numeric_limits<int32_t>::max(), op,
+                    ": the grid is too large");
+    const auto grid = [&](bool wanted) {
+      return gsf::new_empty(occupied, wanted ? shape : std::vector<int64_t>{0, 0, 0},
+                            ScalarType::Int);
+    };
+    // two grids in turn
+    Tensor squares[2] = {grid(true), grid(true)}, stack = grid(true);
+    Tensor sources[2] = {grid(indices), grid(indices)};
+    const typename Backend::Scope scope(occupied);
+    int turn = 0;
+    for (int axis = 2; axis >= 0; --axis, turn = 1 - turn) {
+      const DistanceArgs args{{shape[0], shape[1], shape[2]},
+                              axis,
+                              cptr<bool>(occupied),
+                              cptr<int32_t>(squares[1 - turn]),
+                              indices ? cptr<int32_t>(sources[1 - turn]) : nullptr,
+                              mptr<int32_t>(stack),
+                              mptr<int32_t>(squares[turn]),
+                              indices ? mptr<int32_t>(sources[turn]) : nullptr};
+      if (args.voxels()) Backend::distance_pass(args, scope);
+    }
+    return {squares[1 - turn], sources[1 - turn]};
+  }
+
   static Tensor value_noise(Tensor voxels, std::vector<double> spacings, std::vector<double> shifts,
                             std::vector<double> weights) {
     const char* op = "value_noise";
@@ -152,6 +186,7 @@ struct SpatialOps {
     GSF_IMPL(SpatialOps, largest_shares);
     GSF_IMPL(SpatialOps, nearest_in_cells);
     GSF_IMPL(SpatialOps, box_blur);
+    GSF_IMPL(SpatialOps, distance_transform);
     GSF_IMPL(SpatialOps, value_noise);
   }
 

@@ -34,6 +34,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.ops.density": ("Bulk", "splat_bulk", "occupancy", "density_normals"),
         "gsfluent.ops.spatial": (
             "box_blur",
+            "distance_transform",
             "largest_shares",
             "nearest_in_cells",
             "nearest_labels",

@@ -1,4 +1,4 @@
-"""Labels of voxels, the largest of many fields, the nearest of points among cells, sums, noise.
+"""Labels and distances of voxels, the largest of many fields, points among cells, sums, noise.
 
 What they are for: :mod:`gsfluent.pipeline.partition` and :mod:`gsfluent.spatial.neighbours`.
 """
@@ -17,6 +17,7 @@ from gsfluent.ops._register import fakes, no_gradient
 
 MOST_FIELDS = 32767
 MOST_OCTAVES = 16
+MOST_ALONG = 8192
 
 
 def nearest_labels(place: Tensor, rank: Tensor, shape: Sequence[int], radius: float) -> Tensor:
@@ -157,6 +158,38 @@ def box_blur(indicator: Tensor, width: int, times: int = 3) -> Tensor:
     return torch.ops.gsfluent.box_blur.default(indicator.to(torch.int32), width, times)
 
 
+def distance_transform(occupied: Tensor, *, indices: bool = False) -> tuple[Tensor, Tensor]:
+    """Squared distance of every voxel from the nearest empty one, exact, and which one that is.
+
+    The lower envelope of parabolas along one axis after another, in whole numbers (Meijster,
+    Roerdink and Hesselink, "A general algorithm for computing distance transforms in linear time",
+    2000).
+
+    Args:
+        occupied: bool [X, Y, Z], at most 8192 voxels along an axis and 2^31 in all.
+        indices: Whether to say which voxel is nearest.
+
+    Returns:
+        Squared distances [voxels^2] int32 [X, Y, Z], 2^28 where no voxel of the grid is empty; flat
+        index of the nearest empty voxel, of several the lowest one, int32 [X, Y, Z], the voxel's
+        own where none is empty; [0, 0, 0] unless asked for.
+
+    Raises:
+        TypeError: ``occupied`` is not bool.
+        ValueError: A shape is wrong or too large.
+
+    Gradient: none.
+    """
+    op = "distance_transform"
+    check_tensor(op, "occupied", occupied, shape=("X", "Y", "Z"), dtype=torch.bool)
+    if max(occupied.shape) > MOST_ALONG or occupied.numel() >= 2**31 - 1:
+        raise ValueError(
+            f"{op}: at most {MOST_ALONG} voxels along an axis and 2^31 - 2 in all, "
+            f"got {list(occupied.shape)}"
+        )
+    return torch.ops.gsfluent.distance_transform.default(occupied, indices)
+
+
 def value_noise(
     voxels: Tensor, spacings: Sequence[float], shifts: Sequence[float], weights: Sequence[float]
 ) -> Tensor:
@@ -221,9 +254,14 @@ fakes(
         queries.new_empty((queries.shape[0], count), dtype=torch.int64),
     ),
     box_blur=lambda indicator, width, times: indicator.new_empty(indicator.shape),
+    distance_transform=lambda occupied, indices: (
+        occupied.new_empty(occupied.shape, dtype=torch.int32),
+        occupied.new_empty(occupied.shape if indices else (0, 0, 0), dtype=torch.int32),
+    ),
     value_noise=lambda voxels, *rest: voxels.new_empty(voxels.shape, dtype=torch.float32),
 )
 no_gradient(
     "spatial: no gradient",
-    "nearest_labels", "largest_shares", "nearest_in_cells", "box_blur", "value_noise",
+    "nearest_labels", "largest_shares", "nearest_in_cells", "box_blur", "distance_transform",
+    "value_noise",
 )  # fmt: skip

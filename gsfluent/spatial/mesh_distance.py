@@ -10,6 +10,7 @@ import numpy as np
 
 from gsfluent.errors import InputError
 from gsfluent.spatial.mesh_file import load_mesh
+from gsfluent.spatial.voxels import distance_transform
 
 _log = logging.getLogger(__name__)
 
@@ -89,17 +90,14 @@ def signed_distances(
         band: Distance in spacings up to which it is exact; farther off that to the nearest node
             on the other side is taken, half a spacing more or less. None: exact everywhere.
     """
-    from scipy import ndimage
-
     grid = [corner[i] + spacing * np.arange(size[i]) for i in range(3)]
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = grid_winding(triangles, grid) != 0
     if band is None:
         distance = _distance(nodes, triangles, spacing)
     else:
-        outer = ndimage.distance_transform_edt(~inside)
-        inner = ndimage.distance_transform_edt(inside)
-        steps = np.maximum(np.maximum(outer, inner) - 0.5, 0.0).reshape(-1)
+        away = np.maximum(distance_transform(~inside), distance_transform(inside))
+        steps = np.maximum(away - 0.5, 0.0).reshape(-1).astype(np.float64)
         near = steps <= band
         distance = steps * spacing
         distance[near] = _distance(nodes[near], triangles, spacing)

@@ -101,6 +101,8 @@ def thin_parts(points: Array, radii: Array) -> dict[str, Any]:
     """
     from scipy import ndimage
 
+    from gsfluent.spatial.voxels import distance_transform
+
     low, high = robust_box(points)
     step = float((high - low).max()) / _GRID
     if not step > 0:
@@ -119,9 +121,9 @@ def thin_parts(points: Array, radii: Array) -> dict[str, Any]:
     shell = ndimage.binary_closing(shell, structure=np.ones((3, 3, 3)), iterations=2)
     solid = ndimage.binary_fill_holes(shell)
     ball = _THIN * _GRID
-    core = ndimage.distance_transform_edt(solid) > ball
+    core = distance_transform(solid) > ball
     # Half a voxel more on the way back: the steps of a voxel surface are not thin parts.
-    kept = ndimage.distance_transform_edt(~core) <= ball + 0.5 if core.any() else core
+    kept = distance_transform(~core) <= ball + 0.5 if core.any() else core
     thin = solid & ~kept
     label, count = ndimage.label(thin, structure=np.ones((3, 3, 3)))
     sizes = np.bincount(label.ravel(), minlength=count + 1)[1:]

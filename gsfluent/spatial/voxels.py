@@ -1,4 +1,4 @@
-"""Exact distance transform of voxels, on the CPU by scipy, on a GPU by separable minima."""
+"""Distances and neighbourhoods of the voxels of NumPy arrays."""
 
 from __future__ import annotations
 
@@ -6,45 +6,48 @@ import numpy as np
 import torch
 from torch import Tensor
 
-_FAR = 1 << 14  # voxels: farther than any grid is long; its square still fits in int32
-_CHUNK = 1 << 27  # sums of a parabola and a value at a time, int32
+from gsfluent.ops.spatial import distance_transform as _transform
 
 
 def distance_transform(occupied: np.ndarray, device: torch.device | None = None) -> np.ndarray:
     """Distance [voxels] from every occupied voxel's centre to the nearest empty centre.
 
     Args:
-        occupied: bool [X, Y, Z]; at least one voxel must be empty.
-        device: Where to compute; a CPU (or None) asks scipy.
+        occupied: bool [X, Y, Z] or [X, Y]; at least one voxel must be empty.
+        device: Where to compute; None is the CPU.
 
     Returns:
-        float32 [X, Y, Z]; 0 where empty.
+        float32 as ``occupied``; 0 where empty.
     """
-    if device is None or device.type == "cpu":
-        from scipy import ndimage
-
-        distance: np.ndarray = ndimage.distance_transform_edt(occupied)
-        return distance.astype(np.float32)
-    squared, _ = _separable(torch.from_numpy(np.ascontiguousarray(occupied)).to(device))
-    return squared.float().sqrt().cpu().numpy()
+    squared, _ = _transform(_volume(occupied, device))
+    return _distance(squared, occupied)
 
 
 def nearest_empty(
     occupied: np.ndarray, device: torch.device | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As :func:`distance_transform`, and which empty voxel is nearest.
+    """As :func:`distance_transform`, and which empty voxel is nearest; of several, the first.
 
     Returns:
-        Distances float32 [X, Y, Z], and voxel indices int32 [3, X, Y, Z].
+        Distances float32, as ``occupied``, and voxel indices int32 [3, X, Y, Z] or [2, X, Y].
     """
-    if device is None or device.type == "cpu":
-        from scipy import ndimage
+    squared, flat = _transform(_volume(occupied, device), indices=True)
+    index = []
+    for size in reversed(occupied.shape):
+        index.append(flat % size)
+        flat = flat.div(size, rounding_mode="floor")
+    found = torch.stack(index[::-1]).cpu().numpy()
+    return _distance(squared, occupied), found.reshape(-1, *occupied.shape)
 
-        distance, index = ndimage.distance_transform_edt(occupied, return_indices=True)
-        return distance.astype(np.float32), index
-    squared, flat = _separable(torch.from_numpy(np.ascontiguousarray(occupied)).to(device))
-    index = torch.stack(torch.unravel_index(flat, squared.shape)).int()
-    return squared.float().sqrt().cpu().numpy(), index.cpu().numpy()
+
+def _volume(occupied: np.ndarray, device: torch.device | None) -> Tensor:
+    held = torch.from_numpy(np.ascontiguousarray(occupied)).to(device or "cpu")
+    return held.reshape((1,) * (3 - held.ndim) + held.shape)
+
+
+def _distance(squared: Tensor, like: np.ndarray) -> np.ndarray:
+    result: np.ndarray = squared.float().sqrt().cpu().numpy().reshape(like.shape)
+    return result
 
 
 def grown(occupied: np.ndarray, steps: int) -> np.ndarray:
@@ -62,33 +65,3 @@ def surface(occupied: np.ndarray) -> np.ndarray:
 
     result: np.ndarray = occupied & ~ndimage.binary_erosion(occupied)
     return result
-
-
-def _separable(occupied: Tensor) -> tuple[Tensor, Tensor]:
-    """Squared distances int32 and flat indices of the nearest empty voxels, both [X, Y, Z].
-
-    Distances along z first; then the lower envelope of parabolas along y and along x (Felzenszwalb
-    and Huttenlocher 2012), found by trying all: n^4 additions, which a GPU does in milliseconds.
-    """
-    shape = occupied.shape
-    place = torch.arange(occupied.numel(), device=occupied.device).view(shape)
-    squared = torch.where(occupied, _FAR**2, 0).int()
-    for axis in (2, 1, 0):
-        squared, place = _along(squared.movedim(axis, -1), place.movedim(axis, -1))
-        squared, place = squared.movedim(-1, axis), place.movedim(-1, axis)
-    return squared.contiguous(), place.contiguous()
-
-
-def _along(squared: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower envelope along the last dimension, and the ``place`` it comes from."""
-    length = squared.shape[-1]
-    steps = torch.arange(length, device=squared.device, dtype=torch.int32)
-    parabola = (steps[:, None] - steps[None]) ** 2  # [to, from]
-    rows, origin = squared.reshape(-1, length), place.reshape(-1, length)
-    best, source = torch.empty_like(rows), torch.empty_like(origin)
-    step = max(1, _CHUNK // length**2)
-    for start in range(0, rows.shape[0], step):
-        part = slice(start, start + step)
-        value, index = (rows[part, None, :] + parabola).min(dim=-1)
-        best[part], source[part] = value, origin[part].gather(1, index)
-    return best.view(squared.shape), source.view(place.shape)

@@ -15,8 +15,7 @@ import torch
 from PIL import Image  # noqa: TID253
 
 from gsfluent.io.solid import load_solid
-from gsfluent.pipeline.render.cuts import cut_view
-from gsfluent.pipeline.solid.colors import skin_weights
+from gsfluent.pipeline.render.cuts import CutBody, cut_view
 
 TILT = 25.0  # degrees that the viewer of the last cut stands above it
 
@@ -24,14 +23,14 @@ TILT = 25.0  # degrees that the viewer of the last cut stands above it
 def row(path: Path, up: np.ndarray, size: int) -> np.ndarray:
     """Across, from above, and aslant, [size, 3 * size, 3]."""
     solid = load_solid(path)
-    weights = skin_weights(solid)
+    body = CutBody(solid)
     across = np.cross(up, [1.0, 0.0, 0.3])
     across /= np.linalg.norm(across)
     along = np.cross(up, across)
     asked = ((across, up, 0.0), (-up, along, 0.0), (0.8 * across + 0.6 * along, up, TILT))
     tiles = []
     for normal, top, tilt in asked:
-        image = cut_view(solid, normal, size=size - 10, up=top, tilt=tilt, weights=weights)
+        image = cut_view(body, normal, size=size - 10, up=top, tilt=tilt)
         tile = np.ones((size, size, 3), np.float32)
         high, wide = image.shape[:2]
         y, x = (size - high) // 2, (size - wide) // 2

@@ -1,6 +1,6 @@
 """Labels of voxels, the largest of many fields, the nearest points: against tables of all pairs.
 
-Sums over boxes and value noise: against their references, bit by bit.
+Sums over boxes, value noise and distances: against their references, bit by bit.
 """
 
 from __future__ import annotations
@@ -198,3 +198,40 @@ def test_boxes_and_noise_say_what_is_wrong() -> None:
         ops.value_noise(voxels, [0.0], [0.0], [1.0])
     torch.library.opcheck(torch.ops.gsfluent.box_blur.default, (held.int(), 3, 3))
     torch.library.opcheck(torch.ops.gsfluent.value_noise.default, (voxels, [2.0], [0.0], [1.0]))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.99, 1.0])
+@pytest.mark.parametrize("shape", [(7, 9, 5), (20, 3, 34), (1, 1, 17), (33, 1, 2), (18, 17, 16)])
+def test_distances_to_the_nearest_empty_voxel(
+    device: str, share: float, shape: tuple[int, int, int]
+) -> None:
+    occupied = torch.rand(shape, generator=draw(3)) < share
+    wanted = reference.distance_transform(occupied)
+    same(ops.distance_transform(occupied.to(device), indices=True), wanted)
+    squared, none = ops.distance_transform(occupied.to(device))
+    assert torch.equal(squared.cpu(), wanted[0])
+    assert none.numel() == 0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_distances_of_large_grids_and_of_none(device: str) -> None:
+    occupied = torch.ones(3, 300, 8192, dtype=torch.bool)
+    occupied[2, 299, 8191] = False
+    squared, index = ops.distance_transform(occupied.to(device), indices=True)
+    assert int(squared[0, 0, 0]) == 2**2 + 299**2 + 8191**2
+    assert bool((index == occupied.numel() - 1).all())
+    empty, _ = ops.distance_transform(occupied[:0].to(device))
+    assert empty.shape == (0, 300, 8192)
+
+
+def test_distances_say_what_is_wrong() -> None:
+    with pytest.raises(TypeError, match="occupied"):
+        ops.distance_transform(torch.ones(3, 3, 3))
+    with pytest.raises(ValueError, match="shape"):
+        ops.distance_transform(torch.ones(3, 3, dtype=torch.bool))
+    with pytest.raises(ValueError, match="8192"):
+        ops.distance_transform(torch.ones(1, 1, 8193, dtype=torch.bool))
+    held = torch.ones(4, 3, 5, dtype=torch.bool)
+    for indices in (False, True):
+        torch.library.opcheck(torch.ops.gsfluent.distance_transform.default, (held, indices))

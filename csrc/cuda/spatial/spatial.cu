@@ -124,6 +124,18 @@ __global__ void box_sum_kernel(BoxSumArgs a) {
   if (k < a.voxels()) a.out[k] = a.sum(k);
 }
 
+// A thread for a line. Neighbours of a warp begin side by side but along z, where lines are read
+// from the cache.
+__global__ void distance_pass_kernel(DistanceArgs a, int64_t lines) {
+  const int64_t line = thread_number();
+  if (line >= lines) return;
+  if (a.axis == 2) return distances_along(a, line);
+  const int64_t base = a.first(line);
+  envelope_along(int(a.shape[a.axis]), a.stride(), a.square + base,
+                 a.source ? a.source + base : nullptr, a.stack + base, a.next_square + base,
+                 a.next_source ? a.next_source + base : nullptr);
+}
+
 __global__ void value_noise_kernel(ValueNoiseArgs a) {
   const int64_t i = thread_number();
   if (i < a.count) gsf::value_noise(a, i);
@@ -151,6 +163,12 @@ cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream) {
 
 cudaError_t box_sum(const BoxSumArgs& a, cudaStream_t stream) {
   if (a.voxels()) box_sum_kernel<<<blocks_for(a.voxels()), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+
+cudaError_t distance_pass(const DistanceArgs& a, cudaStream_t stream) {
+  const int64_t lines = a.voxels() / a.shape[a.axis];
+  distance_pass_kernel<<<blocks_for(lines), kThreads, 0, stream>>>(a, lines);
   return cudaGetLastError();
 }
 

@@ -86,6 +86,20 @@ def box_blur(indicator: Tensor, width: int, times: int = 3) -> Tensor:
     return field.to(torch.int32)
 
 
+def distance_transform(occupied: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`gsfluent.ops.distance_transform`, from a table of all pairs."""
+    place = torch.cartesian_prod(*[torch.arange(n) for n in occupied.shape]).view(-1, 3)
+    empty = (~occupied).reshape(-1).nonzero()[:, 0]
+    if not len(empty):
+        own = torch.arange(occupied.numel(), dtype=torch.int32).view(occupied.shape)
+        return torch.full_like(own, 1 << 28), own
+    square = ((place[:, None] - place[empty]) ** 2).sum(2)
+    least = square.min(1).values
+    # of several as near, the first
+    first = (square == least[:, None]).int().argmax(1)
+    return least.int().view(occupied.shape), empty[first].int().view(occupied.shape)
+
+
 _MASK = 0xFFFFFFFF
 
 

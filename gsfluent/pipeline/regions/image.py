@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gsfluent.data import Frame, Solid
 from gsfluent.errors import InputError
 from gsfluent.io.segmentation.files import RawLabels, numbered, read_raw
+from gsfluent.spatial.voxels import distance_transform
 
 _AXES = {"x": (1, 2), "y": (0, 2), "z": (0, 1)}
 """Scene axes that run right and up in a picture taken along each axis, as in ``interior.png``."""
@@ -103,10 +104,8 @@ def _by_depth(
     solid: Solid, flat: NDArray[np.int64], raw: RawLabels
 ) -> tuple[NDArray[np.int64], list[int]]:
     """Each depth, relative to the deepest point, has the label that is most frequent there."""
-    from scipy import ndimage
-
     outline = raw.opaque if raw.opaque is not None else flat > 0
-    distance = ndimage.distance_transform_edt(np.pad(outline, 1))[1:-1, 1:-1]
+    distance = distance_transform(np.pad(outline, 1))[1:-1, 1:-1]
     share = (distance[outline] - 0.5) / max(float(distance.max()) - 0.5, 0.5)
     bins = np.floor(share * _BINS).astype(int).clip(0, _BINS - 1)
     labels, column = np.unique(flat[outline], return_inverse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from gsfluent.data import SURFACE, Camera, Solid
 from gsfluent.draw import draw
 from gsfluent.io import save_image
 from gsfluent.pipeline.solid.colors import skin_colors, skin_weights
+from gsfluent.spatial.voxels import distance_transform, nearest_empty
 
 _GREY = 0.55  # of matter without colour
 _SMOOTH = 3.0  # voxels; whole voxels seen at their own size are stairs and terraces
@@ -55,7 +57,7 @@ class _Eye:
 
 
 def cut_view(
-    solid: Solid,
+    solid: Solid | CutBody,
     axis: int | str | Sequence[float] | np.ndarray = 0,
     offset: float | None = None,
     size: int = 512,
@@ -64,7 +66,6 @@ def cut_view(
     up: Sequence[float] | np.ndarray | None = None,
     tilt: float = 0.0,
     splats: bool = True,
-    weights: np.ndarray | None = None,
 ) -> np.ndarray:
     """Look at the solid with everything before a cutting plane taken away.
 
@@ -73,7 +74,7 @@ def cut_view(
     so that the eye reads the shape.
 
     Args:
-        solid: The solid; ``color`` may be None.
+        solid: The solid; ``color`` may be None. A :class:`CutBody` when there are several views.
         axis: 0, 1, 2 or "x", "y", "z", the axis the cut is perpendicular to; or the plane's normal
             [3], which points into the matter that is left, in the solid's own frame.
         offset: Position of the plane along the normal, world units; None cuts through the middle of
@@ -84,8 +85,6 @@ def cut_view(
         tilt: Angle [degrees] by which the viewer stands above the normal of the plane, below 80.
         splats: Draw the skin behind the plane with the splats themselves; False takes averaged
             colours.
-        weights: From :func:`gsfluent.pipeline.solid.colors.skin_weights`, when there are several
-            views of one solid.
 
     Returns:
         Image float32 [H, W, 3] in 0..1. For a named axis the first remaining axis runs right, the
@@ -99,16 +98,16 @@ def cut_view(
         raise ValueError(f"cut_view: size must be at least 16 pixels, got {size}")
     if not abs(tilt) < 80.0:
         raise ValueError(f"cut_view: tilt must be below 80 degrees, got {tilt}")
-    occupied = solid.occupancy.cpu()
-    if not bool(occupied.any()):
+    body = solid if isinstance(solid, CutBody) else CutBody(solid)
+    if not len(body.centers):
         return np.full((size, size, 3), background, np.float32)
-    centers = solid.voxel_centers().double().cpu().numpy()
-    place = centers @ normal
-    half = 0.5 * solid.voxel * np.abs(normal).sum()
+    place = body.centers @ normal
+    voxel = body.solid.voxel
+    half = 0.5 * voxel * np.abs(normal).sum()
     low, high = float(place.min()) - half, float(place.max()) + half
     plane = 0.5 * (low + high) if offset is None else min(max(offset, low), high)
-    eye = _eye(centers[place >= plane - half], normal, right, top, tilt, size, solid.voxel)
-    view = _Trace(solid, normal, plane, eye, weights)
+    eye = _eye(body.centers[place >= plane - half], normal, right, top, tilt, size, voxel)
+    view = _Trace(body, normal, plane, eye)
     image, covered = view.shaded(splats)
     image = image * covered[..., None] + background * (1.0 - covered[..., None])
     return (image.reshape(eye.height, eye.width, 3).numpy().clip(0.0, 1.0)).astype(np.float32)
@@ -167,21 +166,42 @@ def _eye(
     return _Eye(middle, right, above, forward, pixel, *count)
 
 
+@dataclass(frozen=True)
+class CutBody:
+    """A solid of which several views are asked for, with what they share."""
+
+    solid: Solid
+
+    @functools.cached_property
+    def field(self) -> Tensor:
+        """Signed distance [voxels] without the stairs of voxels, float32 [X, Y, Z]."""
+        return _smooth_field(self.solid.occupancy.cpu().numpy())
+
+    @functools.cached_property
+    def matter(self) -> Tensor:
+        """Colours, continued outward, float32 [1, 3, X, Y, Z]."""
+        return _spread(self.solid)
+
+    @functools.cached_property
+    def weights(self) -> np.ndarray:
+        """How much each splat shows, [N]."""
+        return skin_weights(self.solid)
+
+    @functools.cached_property
+    def centers(self) -> np.ndarray:
+        """Centres of the occupied voxels [world units], float64 [M, 3]."""
+        found: np.ndarray = self.solid.voxel_centers().double().cpu().numpy()
+        return found
+
+
 class _Trace:
     """One picture: rays against the solid's surface and the plane."""
 
-    def __init__(
-        self,
-        solid: Solid,
-        normal: np.ndarray,
-        plane: float,
-        eye: _Eye,
-        weights: np.ndarray | None,
-    ) -> None:
-        self.solid, self.eye, self.plane, self.weights = solid, eye, plane, weights
-        self.matter: Tensor | None = None
+    def __init__(self, body: CutBody, normal: np.ndarray, plane: float, eye: _Eye) -> None:
+        self.body, self.eye, self.plane = body, eye, plane
+        self.solid = solid = body.solid
         self.normal = torch.from_numpy(normal)
-        self.field = _smooth_field(solid.occupancy.cpu().numpy())
+        self.field = body.field
         self.origin = solid.origin.cpu().double()
         self.start = eye.rays()
         self.forward = torch.from_numpy(eye.forward)
@@ -250,19 +270,17 @@ class _Trace:
         """Colours of the matter at points [N, 3] of the plane."""
         if self.solid.color is None:
             return torch.full((len(points), 3), _GREY)
-        if self.matter is None:
-            self.matter = _spread(self.solid)
         place = (points - self.origin) / self.solid.voxel
         size = torch.tensor(self.field.shape)
         where = (2.0 * place / size - 1.0).flip(-1).float()[None, None, None]
         found = functional.grid_sample(
-            self.matter, where, padding_mode="border", align_corners=False
+            self.body.matter, where, padding_mode="border", align_corners=False
         )
         return found[0, :, 0, 0].T
 
     def _skin(self, points: Tensor, rows: Tensor, splats: bool) -> Tensor:
         """Shaded colours of the skin at points [N, 3], seen through the pixels ``rows``."""
-        weights = skin_weights(self.solid) if self.weights is None else self.weights
+        weights = self.body.weights
         flat = torch.from_numpy(skin_colors(self.solid, points.numpy(), weights=weights))
         if splats:
             drawn, alpha = self._drawn(weights)
@@ -317,9 +335,9 @@ class _Trace:
 
 def _smooth_field(occupied: np.ndarray) -> Tensor:
     """Signed distance [voxels], negative inside, without the stairs and hairs of voxels."""
-    outer = np.maximum(ndimage.distance_transform_edt(~occupied) - 0.5, 0.0)
-    inner = np.maximum(ndimage.distance_transform_edt(occupied) - 0.5, 0.0)
-    signed = (outer - inner).astype(np.float32)
+    outer = np.maximum(distance_transform(~occupied) - 0.5, 0.0)
+    inner = np.maximum(distance_transform(occupied) - 0.5, 0.0)
+    signed = outer - inner
     soft = ndimage.gaussian_filter(signed, _SMOOTH, mode="nearest")
     field = np.clip(soft, signed - _MOST, signed + _MOST)
     # what smoothing takes away altogether is fuzz, unless there is much of it in one piece: a wall
@@ -339,7 +357,7 @@ def _spread(solid: Solid) -> Tensor:
     """Colours of the matter, continued outward by the nearest, float32 [1, 3, X, Y, Z]."""
     assert solid.color is not None
     occupied = solid.occupancy.cpu().numpy()
-    nearest = ndimage.distance_transform_edt(~occupied, return_distances=False, return_indices=True)
+    nearest = nearest_empty(~occupied)[1]
     color = solid.color.float().cpu().numpy()[tuple(nearest)]
     return torch.from_numpy(color).permute(3, 0, 1, 2)[None].contiguous()
 
@@ -367,7 +385,7 @@ def save_cut_views(solid: Solid, path: Path) -> None:
     Raises:
         RunError: The disk is full.
     """
-    weights = skin_weights(solid)
+    body = CutBody(solid)
     turn = np.eye(3) if solid.frame is None else solid.frame.rotation.numpy()
     x, y, z = turn  # scene axes in the solid's own frame
     aslant = 0.8 * x + 0.6 * y
@@ -377,9 +395,7 @@ def save_cut_views(solid: Solid, path: Path) -> None:
         {"axis": -z, "up": y},
         {"axis": aslant, "up": z, "tilt": _TILT},
     ]
-    views = [
-        cut_view(solid, **each, size=_HEIGHT, background=_GROUND, weights=weights) for each in asked
-    ]
+    views = [cut_view(body, **each, size=_HEIGHT, background=_GROUND) for each in asked]
     height = max(view.shape[0] for view in views) + 2 * _GAP
     width = sum(view.shape[1] for view in views) + _GAP * (len(views) + 1)
     sheet = np.full((height, width, 3), _GROUND, np.float32)

@@ -20,6 +20,7 @@ from gsfluent._lazy import ndimage
 from gsfluent.errors import check_choice
 from gsfluent.pipeline.texture.volume.domain import axis_frame
 from gsfluent.pipeline.texture.volume.noise import value_noise
+from gsfluent.spatial.voxels import distance_transform
 
 CUTS = ("across", "along")
 """How a photograph was cut, relative to the object's axis."""
@@ -137,7 +138,7 @@ def outline(mask: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 def _core(inside: np.ndarray, index: np.ndarray) -> np.ndarray:
     """The centroid, or the deepest voxel when the centroid is not well inside (a ring, a bow)."""
-    depth = ndimage.distance_transform_edt(inside)
+    depth = distance_transform(inside)
     middle = index.mean(0)
     if depth[tuple(np.rint(middle).astype(int))] > 0.4 * depth.max():
         return np.asarray(middle)

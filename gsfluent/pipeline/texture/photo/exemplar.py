@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsfluent._lazy import cv2, ndimage
+from gsfluent._lazy import cv2
 from gsfluent.colors import rgb_to_lab
 from gsfluent.errors import InputError, check_choice
 from gsfluent.pipeline.texture.photo.light import (
@@ -24,6 +24,7 @@ from gsfluent.pipeline.texture.photo.mask import CUTOUTS, cut_out, strip_ground,
 from gsfluent.pipeline.texture.photo.read import read_pixels
 from gsfluent.pipeline.texture.photo.stain import fill_holes, grey_share, recolor, remove_stain
 from gsfluent.pipeline.texture.volume.domain import nearest_in
+from gsfluent.spatial.voxels import distance_transform
 
 logger = logging.getLogger(__name__)
 
@@ -290,5 +291,5 @@ def _palette(name: str) -> np.ndarray:
 
 def _depth(mask: np.ndarray) -> np.ndarray:
     """Distance of pixel centres to the outline [pixels]."""
-    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    distance = distance_transform(np.pad(mask, 1))[1:-1, 1:-1]
     return np.where(mask, distance - 0.5, 0.0).astype(np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import rgb_to_lab
+from gsfluent.spatial.voxels import distance_transform
 
 CUTOUTS = ("auto", "ground", "grabcut", "none")
 
@@ -159,7 +160,7 @@ def trim_rim(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, str | Non
     whose colour differs from the colour most of the rim has at that depth: ground that a tight crop
     kept, and skin seen from the side beyond the cut. Layers that go all round stay.
     """
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    depth = distance_transform(np.pad(mask, 1))[1:-1, 1:-1]
     largest = float(depth.max())
     reach = 0.12 * largest
     band = mask & (depth <= reach)

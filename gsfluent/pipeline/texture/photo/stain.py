@@ -7,6 +7,7 @@ import numpy as np
 from gsfluent._lazy import cv2, ndimage
 from gsfluent.colors import lab_to_rgb, rgb_to_lab
 from gsfluent.pipeline.texture.volume.domain import smoothstep
+from gsfluent.spatial.voxels import distance_transform
 
 _GREY = 8.0  # Lab chroma below which a pixel counts as grey
 _CAVITY = 0.65  # light at the bottom of a small cavity relative to its rim
@@ -58,7 +59,7 @@ def fill_holes(
     shadow = cv2.dilate(wide, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (6 * rim + 1,) * 2))
     wall = cv2.inpaint(bytes_, shadow, 3 * rim, cv2.INPAINT_TELEA).astype(np.float32) / 255.0
     wall = np.asarray(cv2.GaussianBlur(wall, (0, 0), 2.0 * rim))
-    far = smoothstep(ndimage.distance_transform_edt(wide) / (0.012 * np.sqrt(area)))[..., None]
+    far = smoothstep(distance_transform(wide > 0) / (0.012 * np.sqrt(area)))[..., None]
     # light that went back and forth between the walls is dimmer and more of their colour
     cavity = wall ** (1.0 + far) * (1.0 - (1.0 - _CAVITY) * far)
     done = np.where(wide[..., None] > 0, cavity, image).astype(np.float32)

@@ -7,9 +7,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsfluent._lazy import ndimage
 from gsfluent.data import Solid
 from gsfluent.errors import InputError
+from gsfluent.spatial.voxels import nearest_empty
 
 Options = TypeVar("Options")
 
@@ -133,7 +133,7 @@ def options_of(kind: type[Options], name: str, value: Any) -> Options:
 
 def nearest_in(mask: np.ndarray) -> tuple[np.ndarray, ...]:
     """Index of the nearest cell of a mask for every cell; at least one must be in it."""
-    return tuple(ndimage.distance_transform_edt(~mask, return_distances=False, return_indices=True))
+    return tuple(nearest_empty(~mask)[1])
 
 
 def block_mean(field: np.ndarray, factor: int, dimensions: int) -> np.ndarray:
