@@ -264,6 +264,8 @@ class Solver(SolverState):
                 b.sdf = sdf.to(self.device).contiguous()
         if radius is not None:
             b.radius = radius.contiguous()
+            if self.device.type == "cuda":  # on a CPU the kernels have them
+                b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
         self._buffers = b
         self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
         if bool(self.frame.any()):
@@ -298,6 +300,8 @@ class Solver(SolverState):
                     hint="give radius too, or leave out objects: fields then touch at nodes",
                 )
             b.object = self._per_field("objects", objects)
+            if self.device.type == "cuda":
+                b.press = torch.zeros_like(b.sums)
         if parent is not None or cut is not None:
             b.parent, b.cut = self._per_field("parent", parent), self._per_field("cut", cut)
         heaviest = float(mass.max())
@@ -491,7 +495,6 @@ class Solver(SolverState):
             else:  # room for blocks has grown since
                 target.zero_()
                 target[: value.shape[0]] = value
-        b.sums.zero_()
-        b.moments.zero_()
-        b.impulse_units.zero_()
+        for name in ("sums", "moments", "push", "press", "impulse_units"):
+            getattr(b, name).zero_()
         self._write(rebuild=1, done=1, grow=0, reason=0, touched=0, lost=0, leaving=0)
