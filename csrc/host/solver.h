@@ -61,6 +61,10 @@ enum SolverBuffer : int {
   kViscous,
   kObject,
   kOwn,
+  kFreeVelocity,
+  kSpringRows,
+  kPush,
+  kPress,
   kSolverBuffers
 };
 
@@ -163,6 +167,10 @@ struct SolverOps {
         {"viscous", n, kViscousColumns, real, true},
         {"object", ints[kFields], 1, i32, true},
         {"own", n, 9, real, true},
+        {"free_velocity", c * kBlockNodes, 4, real, true},
+        {"spring_rows", s.row_count + 2, 2, ScalarType::Double, true},
+        {"push", c * kBlockNodes, 4, i64, true},
+        {"press", c * kBlockNodes, 4, i64, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -189,6 +197,15 @@ struct SolverOps {
                     "solver: colliders, collider_state and impulse must have the same rows");
     STD_TORCH_CHECK(b[kParent].numel() == b[kCut].numel(),
                     "solver: parent and cut must have the same rows");
+    const auto comes_with = [&](int part, int room) {
+      STD_TORCH_CHECK(!device || b[part].numel() == 0 || b[room].numel() > 0,
+                      "solver: ", wanted[part].name, " needs ", wanted[room].name, " on a device");
+    };
+    comes_with(kOwn, kFreeVelocity);
+    comes_with(kContactRadius, kSpringRows);
+    comes_with(kContactRadius, kPush);
+    comes_with(kObject, kContactRadius);
+    comes_with(kObject, kPress);
     const bool any_law = ints[kLawSet] != 0;
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
                     "solver: these laws need alpha and peak");
@@ -245,6 +262,10 @@ struct SolverOps {
     s.object = int_at(kObject);
     s.own = real_at(kOwn);
     s.flip = static_cast<T>(floats[kFlip]);
+    s.free_velocity = real_at(kFreeVelocity);
+    s.spring_rows = static_cast<double*>(any_at(kSpringRows));
+    s.push = static_cast<int64_t*>(any_at(kPush));
+    s.press = static_cast<int64_t*>(any_at(kPress));
     return s;
   }
 

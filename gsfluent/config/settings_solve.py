@@ -86,8 +86,8 @@ class SolveSettings:
     )
     cfl: float = key(
         number(0.05, 0.9),
-        "Courant number of the automatic time step. Below 0.5 a CPU keeps what shorter steps would "
-        "lose; a GPU loses it.",
+        "Courant number of the automatic time step. Below 0.5 points keep what shorter steps would "
+        "lose.",
         "0.7",
         default=0.5,
     )
@@ -119,7 +119,7 @@ class SolveSettings:
     contact: str = key(
         choice("nodes", "points"),
         "What floors, colliders and other bodies push: `nodes` of the grid, up to 1.5 cells before "
-        "the matter is there, or its `points` where they are (CPU only, `cfl` at most 0.5, steps "
+        "the matter is there, or its `points` where they are (`cfl` at most 0.5, on a CPU steps "
         "about a tenth slower). Pieces of one body touch at nodes.",
         "points",
         default="nodes",

@@ -114,7 +114,7 @@ class Solver(SolverState):
         radius: Contact radius of each point [m], [N]: colliders push points that are nearer than it
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
-            point in as deep. Default: colliders hold nodes. CPU only.
+            point in as deep. Default: colliders hold nodes.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`), for laws 0 and
             1; others have none. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
@@ -137,7 +137,7 @@ class Solver(SolverState):
         flip: Share of their own velocity and affine matrix, less what the nodes would give back by
             themselves, that points keep in a step (FLIP; the rest is APIC), in [0, 1). With
             ``1 - 2 cfl`` shorter steps lose as much in the same time as those of ``cfl`` 0.5
-            (docs/theory/mpm.md). 0 costs nothing. CPU only, not beside law ``phase_field``.
+            (docs/theory/mpm.md). 0 costs nothing. Not beside law ``phase_field``.
         frame: Velocity of the grid [m/s], which changes no law of motion but what the grid loses.
             With colliders 0. Default: without them that of the matter, each body by its mass, so
             that what happens does not depend on who watches (docs/theory/mpm.md). Positions and
@@ -264,6 +264,8 @@ class Solver(SolverState):
                 b.sdf = sdf.to(self.device).contiguous()
         if radius is not None:
             b.radius = radius.contiguous()
+            if self.device.type == "cuda":  # on a CPU the kernels have them
+                b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
         self._buffers = b
         self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
         if bool(self.frame.any()):
@@ -298,6 +300,8 @@ class Solver(SolverState):
                     hint="give radius too, or leave out objects: fields then touch at nodes",
                 )
             b.object = self._per_field("objects", objects)
+            if self.device.type == "cuda":
+                b.press = torch.zeros_like(b.sums)
         if parent is not None or cut is not None:
             b.parent, b.cut = self._per_field("parent", parent), self._per_field("cut", cut)
         heaviest = float(mass.max())
@@ -338,23 +342,13 @@ class Solver(SolverState):
                 f"Solver: flip: phase_field matter does not know it yet, got {share:g}",
                 hint="leave it out there: points are moved by APIC alone",
             )
-        if share > 0.0 and self.device.type != "cpu":
-            raise InputError(
-                f"Solver: flip: {self.device.type} does not know it yet, got {share:g}",
-                hint="leave it out there: points are moved by APIC alone",
-            )
         return float(share)
 
     @staticmethod
     def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:
-        """Refuse contact radii that this device does not know or that are no numbers."""
+        """Refuse contact radii that are too large or no numbers."""
         if radius is None:
             return
-        if like.device.type != "cpu":
-            raise InputError(
-                f"Solver: radius: {like.device.type} does not push points yet",
-                hint="leave it out there: colliders then hold nodes",
-            )
         check_tensor("Solver", "radius", radius, shape=(like.shape[0],), like=like)
         if not bool(torch.isfinite(radius).all()):
             raise ValueError("Solver: radius must be finite")
@@ -491,7 +485,6 @@ class Solver(SolverState):
             else:  # room for blocks has grown since
                 target.zero_()
                 target[: value.shape[0]] = value
-        b.sums.zero_()
-        b.moments.zero_()
-        b.impulse_units.zero_()
+        for name in ("sums", "moments", "push", "press", "impulse_units"):
+            getattr(b, name).zero_()
         self._write(rebuild=1, done=1, grow=0, reason=0, touched=0, lost=0, leaving=0)

@@ -91,6 +91,10 @@ class Buffers:
     viscous: Tensor
     object: Tensor
     own: Tensor
+    free_velocity: Tensor
+    spring_rows: Tensor
+    push: Tensor
+    press: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -128,6 +132,13 @@ class Buffers:
         self.moments = torch.zeros(many, BLOCK_NODES, CONTACT_MOMENTS, dtype=moments, device=device)
         self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
+        if device.type == "cuda":  # on a CPU the kernels have them
+            if self.own.numel():
+                self.free_velocity = torch.zeros_like(self.node_velocity)
+            if self.radius.numel():
+                self.push = torch.zeros_like(self.sums)
+            if self.object.numel():
+                self.press = torch.zeros_like(self.sums)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
         self.key = torch.zeros(entries, dtype=torch.int64, device=device)
@@ -186,6 +197,9 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):
         values[name] = zeros(0, 4, dtype=torch.int32)
+    for name in ("push", "press"):
+        values[name] = zeros(0, dtype=torch.int64)
+    values["spring_rows"] = zeros(0, dtype=torch.float64)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
     values["impulse_units"] = zeros(0, IMPULSE_SUMS, dtype=torch.int64)
     values["impulse"] = zeros(0, IMPULSE_SUMS, dtype=torch.float64)

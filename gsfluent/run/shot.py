@@ -146,7 +146,7 @@ def run_in(
         return left()
 
     try:
-        check_shot(shot, device)
+        check_shot(shot)
         with (
             heard_warnings("gsfluent") as heard,
             heartbeat("gsfluent", at_work, adds=progressed) as watched,

@@ -22,14 +22,13 @@ from gsfluent.pipeline.texture import Texture
 from gsfluent.stages.simulate import build_scene, solver_options
 
 
-def check_shot(shot: Shot, device: torch.device) -> None:
+def check_shot(shot: Shot) -> None:
     """Make all that a shot asks for out of stand-ins, so that what cannot be is refused now.
 
     What hangs on the input itself is found when it is read: by the first stages.
 
     Args:
         shot: What is asked for.
-        device: Where the work will be done.
 
     Raises:
         InputError: A setting, material, event, collider, lamp or camera that cannot be.
@@ -42,11 +41,7 @@ def check_shot(shot: Shot, device: torch.device) -> None:
     light_of(shot)
     looks_of(shot)
     _check_camera(shot)
-    if solver_options(shot).surface and device.type != "cpu":
-        raise InputError(
-            f"solve.contact: points are not pushed on {device.type} yet",
-            "leave it out, or run with --device cpu",
-        )
+    solver_options(shot)
     # parts that photographs tell apart are looked at as if they were everywhere
     objects = {
         name: dataclasses.replace(

@@ -27,6 +27,9 @@ MATTER: dict[str, dict[str, Any]] = {
 }
 
 
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+
+
 def impact(dtype: torch.dtype = torch.float64, radius: float = 2.5, **options: Any) -> World:
     """Two balls that meet off the axes, rough where they are brittle."""
     points, away = ball([0.0, 0.0, 0.0], radius, SPACING), torch.tensor([radius + 0.4, 0.2, 0.1])
@@ -38,27 +41,33 @@ def impact(dtype: torch.dtype = torch.float64, radius: float = 2.5, **options: A
     return bodies(parts, [speed, -speed], dtype=dtype, **options)
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", MATTER)
-def test_solver_does_what_the_composed_operators_do(name: str) -> None:
+def test_solver_does_what_the_composed_operators_do(name: str, device: str) -> None:
+    if device == "cuda" and name == "metal with a rate":
+        pytest.skip("a law of the CPU")
     worlds = []
-    for engine in ("solver", "ops"):
-        with running_on("cpu", engine):  # type: ignore[arg-type]
+    for place, engine in ((device, "solver"), ("cpu", "ops")):
+        with running_on(place, engine):  # type: ignore[arg-type]
             given = {**MATTER[name], "flip": 0.4, "dt": 0.2}
             worlds.append(impact(frame=(0.0, 0.0, 0.0), **given))
         worlds[-1].run(steps=40)
     have, want = worlds
     assert have.engine == "solver" and want.engine == "ops"
+    bar = 1e-11 if device == "cpu" else 1e-9
     for part in ("position", "velocity", "affine", "strain", "alpha", "deformation"):
         a, b = getattr(have, part), getattr(want, part)
         if b is not None:
-            assert float((a - b).abs().max()) <= 1e-11 * (1.0 + float(b.abs().max())), part
+            assert float((a.cpu() - b).abs().max()) <= bar * (1.0 + float(b.abs().max())), part
     assert float((have.strain**2).sum()) > 0.0
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.9])
-def test_momentum_is_kept_and_no_energy_made(share: float) -> None:
-    world = impact(flip=share, cfl=0.5 - 0.5 * share)
-    mass, about = world.scene.mass, torch.zeros(3, dtype=torch.float64)
+def test_momentum_is_kept_and_no_energy_made(share: float, device: str) -> None:
+    with running_on(device):
+        world = impact(flip=share, cfl=0.5 - 0.5 * share)
+    mass, about = world.scene.mass, torch.zeros(3, dtype=torch.float64, device=device)
 
     def sums() -> tuple[torch.Tensor, torch.Tensor, float]:
         inner = 0.25 * (world.affine**2).sum(dim=(1, 2))
@@ -76,10 +85,12 @@ def test_momentum_is_kept_and_no_energy_made(share: float) -> None:
     assert now < 0.95 * energy  # they have met
 
 
-def test_order_of_the_points_leaves_no_trace() -> None:
+@pytest.mark.parametrize("device", DEVICES)
+def test_order_of_the_points_leaves_no_trace(device: str) -> None:
     given = dict(flip=0.5, cfl=0.25, frame=(0.0, 0.0, 0.0))
-    one = impact(torch.float32, **given)
-    turn = torch.randperm(len(one.position), generator=torch.Generator().manual_seed(1))
+    with running_on(device):
+        one = impact(torch.float32, **given)
+    turn = torch.randperm(len(one.position), generator=torch.Generator().manual_seed(1)).to(device)
     scene = one.scene
     assert scene.body is not None
     two = World(
@@ -92,13 +103,16 @@ def test_order_of_the_points_leaves_no_trace() -> None:
         assert torch.equal(getattr(one, part)[turn], getattr(two, part)), part
 
 
-def test_calls_divide_a_run_without_a_trace() -> None:
-    whole, parts = (impact(flip=0.5, dt=0.25) for _ in range(2))
+@pytest.mark.parametrize("device", DEVICES)
+def test_calls_divide_a_run_without_a_trace(device: str) -> None:
+    with running_on(device):
+        whole, parts = (impact(flip=0.5, dt=0.25) for _ in range(2))
     whole.run(steps=24)
     for _ in range(4):
         parts.run(steps=6)
-    assert torch.allclose(whole.velocity, parts.velocity, rtol=0.0, atol=1e-13)
-    assert torch.allclose(whole.affine, parts.affine, rtol=0.0, atol=1e-13)
+    bar = 1e-13 if device == "cpu" else 1e-11  # other blocks, other units of the sums
+    assert torch.allclose(whole.velocity, parts.velocity, rtol=0.0, atol=bar)
+    assert torch.allclose(whole.affine, parts.affine, rtol=0.0, atol=bar)
 
 
 def test_shorter_steps_break_as_much() -> None:
@@ -111,11 +125,10 @@ def test_a_shot_keeps_what_its_courant_number_says(cfl: float, flip: float) -> N
     assert SolverOptions(cfl=cfl).flip == pytest.approx(flip)
 
 
-def _solver(device: str = "cpu", **options: Any) -> ops.Solver:
-    points = torch.tensor([[0.1, 0.1, 0.1]], device=device)
-    one = torch.ones(1, device=device)
-    law = torch.tensor([0], dtype=torch.int32, device=device)
-    given = {"law": law, "params": BRITTLE[None].float().to(device), **options}
+def _solver(**options: Any) -> ops.Solver:
+    points, one = torch.tensor([[0.1, 0.1, 0.1]]), torch.ones(1)
+    law = torch.tensor([0], dtype=torch.int32)
+    given = {"law": law, "params": BRITTLE[None].float(), **options}
     return ops.Solver(points, torch.zeros_like(points), one, one, dx=1.0, **given)
 
 
@@ -129,9 +142,3 @@ def test_phase_field_matter_is_refused() -> None:
     params = torch.tensor([[0.4, 0.5, 0.01, 1.0, 1.0, 0.0, 1.0, 0.0]])
     with pytest.raises(InputError, match="phase_field"):
         _solver(flip=0.5, law=torch.tensor([9], dtype=torch.int32), params=params)
-
-
-@pytest.mark.cuda
-def test_a_gpu_says_that_it_does_not_know_it() -> None:
-    with pytest.raises(InputError, match="cuda does not know it yet"):
-        _solver("cuda", flip=0.5)

@@ -69,15 +69,13 @@ def test_it_is_refused_before_any_work(
     ],
 )  # fmt: skip
 def test_what_can_be_passes(splats: Path, changes: dict[str, Any]) -> None:
-    check_shot(shot(splats, **changes), torch.device("cpu"))
+    check_shot(shot(splats, **changes))
 
 
 def test_points_are_pushed_where_they_can_be(splats: Path) -> None:
     pushed = shot(splats, solve={"contact": "points"})
     assert solver_options(pushed).surface and not solver_options(shot(splats)).surface
     assert moving_settings(pushed) != moving_settings(shot(splats))
-    check_shot(pushed, torch.device("cpu"))
-    with pytest.raises(InputError, match="not pushed on cuda"):
-        check_shot(pushed, torch.device("cuda"))
+    check_shot(pushed)
     with pytest.raises(InputError, match="cfl must be at most"):
-        check_shot(shot(splats, solve={"contact": "points", "cfl": 0.8}), torch.device("cpu"))
+        check_shot(shot(splats, solve={"contact": "points", "cfl": 0.8}))

@@ -6,7 +6,7 @@
 //   velocity     velocity and slope, twelve components          three planes of four
 //   strain       six components                                 a plane of four, one of two
 //   deformation  nine components                                two planes of four, one of one
-//   viscous      nine components                                likewise
+//   viscous, own nine components                                likewise
 //
 // `meta` and `slope` of SolverView are null there.
 #pragma once
@@ -28,6 +28,10 @@ struct alignas(2 * sizeof(T)) Pair {
 template <typename T>
 GSF_HOST_DEVICE Quad<T>* quad_plane(const SolverView<T>& s, T* array, int g) {
   return reinterpret_cast<Quad<T>*>(array) + g * s.count;
+}
+template <typename T>
+GSF_HOST_DEVICE const Quad<T>* quad_plane(const SolverView<T>& s, const T* array, int g) {
+  return reinterpret_cast<const Quad<T>*>(array) + g * s.count;
 }
 template <typename T>
 GSF_HOST_DEVICE Pair<T>* strain_pairs(const SolverView<T>& s) {
@@ -87,6 +91,18 @@ GSF_HOST_DEVICE void store_meta(const SolverView<T>& s, int64_t p, uint32_t meta
 #endif
 }
 
+// Velocity alone.
+template <typename T>
+GSF_HOST_DEVICE void load_speed(const SolverView<T>& s, int64_t p, T* velocity) {
+#ifdef __CUDA_ARCH__
+  const Quad<T> a = quad_plane(s, s.velocity, 0)[p];
+  velocity[0] = a.x;
+  velocity[1] = a.y;
+  velocity[2] = a.z;
+#else
+  for (int c = 0; c < 3; ++c) velocity[c] = s.velocity[3 * p + c];
+#endif
+}
 // Velocity and slope.
 template <typename T>
 GSF_HOST_DEVICE void load_motion(const SolverView<T>& s, int64_t p, T* velocity, T* slope) {
@@ -135,41 +151,30 @@ GSF_HOST_DEVICE void store_strain(const SolverView<T>& s, int64_t p, const Sym3<
 #endif
 }
 
+// Nine components of a point: deformation, viscous, own.
 template <typename T>
-GSF_HOST_DEVICE void load_deformation(const SolverView<T>& s, int64_t p, T* f) {
+GSF_HOST_DEVICE void load_nine(const SolverView<T>& s, const T* array, int64_t p, T* out) {
 #ifdef __CUDA_ARCH__
-  const Quad<T> a = quad_plane(s, s.deformation, 0)[p], b = quad_plane(s, s.deformation, 1)[p];
-  const T last = s.deformation[8 * s.count + p];
+  const Quad<T> a = quad_plane(s, array, 0)[p], b = quad_plane(s, array, 1)[p];
+  const T last = array[8 * s.count + p];
   const T values[9] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, last};
-  for (int c = 0; c < 9; ++c) f[c] = values[c];
+  for (int c = 0; c < 9; ++c) out[c] = values[c];
 #else
-  for (int c = 0; c < 9; ++c) f[c] = s.deformation[9 * p + c];
+  for (int c = 0; c < 9; ++c) out[c] = array[9 * p + c];
 #endif
 }
 template <typename T>
-GSF_HOST_DEVICE void store_deformation(const SolverView<T>& s, int64_t p, const T* f) {
+GSF_HOST_DEVICE void store_nine(const SolverView<T>& s, T* array, int64_t p, const T* f) {
 #ifdef __CUDA_ARCH__
-  quad_plane(s, s.deformation, 0)[p] = {f[0], f[1], f[2], f[3]};
-  quad_plane(s, s.deformation, 1)[p] = {f[4], f[5], f[6], f[7]};
-  s.deformation[8 * s.count + p] = f[8];
+  quad_plane(s, array, 0)[p] = {f[0], f[1], f[2], f[3]};
+  quad_plane(s, array, 1)[p] = {f[4], f[5], f[6], f[7]};
+  array[8 * s.count + p] = f[8];
 #else
-  for (int c = 0; c < 9; ++c) s.deformation[9 * p + c] = f[c];
+  for (int c = 0; c < 9; ++c) array[9 * p + c] = f[c];
 #endif
 }
 
-// The nine words of a point's viscosity.
-template <typename T>
-GSF_HOST_DEVICE void load_viscous(const SolverView<T>& s, int64_t p, T* own) {
-#ifdef __CUDA_ARCH__
-  const Quad<T> a = quad_plane(s, s.viscous, 0)[p], b = quad_plane(s, s.viscous, 1)[p];
-  const T last = s.viscous[8 * s.count + p];
-  const T values[9] = {a.x, a.y, a.z, a.w, b.x, b.y, b.z, b.w, last};
-  for (int c = 0; c < 9; ++c) own[c] = values[c];
-#else
-  for (int c = 0; c < 9; ++c) own[c] = s.viscous[9 * p + c];
-#endif
-}
-// The strain of its spring, its first six words; `own` as it was loaded.
+// The strain of a viscous point's spring, its first six words; `own` as it was loaded.
 template <typename T>
 GSF_HOST_DEVICE void store_spring(const SolverView<T>& s, int64_t p, const Sym3<T>& e,
                                   const T* own) {

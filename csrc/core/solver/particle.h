@@ -165,7 +165,7 @@ GSF_HOST_DEVICE void store_slope(T* out, const Mat3<T>& c, const Sym3<T>& tau, c
 // Affine velocity beside a velocity `given` to a particle that moves by `value`: what moves by one
 // velocity and has another would change its angular momentum by dt value x given.
 template <typename T>
-Mat3<T> spin_beside(const T* value, const T* given, T dt, T inv_dx) {
+GSF_HOST_DEVICE Mat3<T> spin_beside(const T* value, const T* given, T dt, T inv_dx) {
   const T scale = T(-2) * dt * inv_dx * inv_dx;
   Mat3<T> spin{};
   for (int i = 0; i < 3; ++i) {
@@ -176,19 +176,20 @@ Mat3<T> spin_beside(const T* value, const T* given, T dt, T inv_dx) {
   return spin;
 }
 
-// What the transfer took of a particle's own motion is given back: s.velocity and s.own hold that
-// share of it (cpu/mpm/flip.h), and get what the particle has in the end. CPU only.
+// What the transfer took of a particle's own motion is given back: `velocity` and `own` hold that
+// share of it, and get what the particle has in the end, which is stored.
 template <typename T>
-void keep_own(const SolverView<T>& s, int64_t p, const Mat3<T>& c, T mass, const T* value, T dt,
-              T* slope) {
-  const Mat3<T> spin = spin_beside(value, s.velocity + 3 * p, dt, s.inv_dx);
+GSF_HOST_DEVICE void keep_own(const SolverView<T>& s, int64_t p, const Mat3<T>& c, T mass,
+                              const T* value, T dt, T* velocity, T* own, T* slope) {
+  const Mat3<T> spin = spin_beside(value, velocity, dt, s.inv_dx);
   for (int i = 0; i < 9; ++i) {
-    const T given = s.own[9 * p + i] + mass * spin.m[i];
+    const T given = own[i] + mass * spin.m[i];
     slope[i] += given;
-    s.own[9 * p + i] = mass * c.m[i] + given;
-    s.slope[9 * p + i] = slope[i];
+    own[i] = mass * c.m[i] + given;
   }
-  for (int i = 0; i < 3; ++i) s.velocity[3 * p + i] += value[i];
+  for (int i = 0; i < 3; ++i) velocity[i] += value[i];
+  store_nine(s, s.own, p, own);
+  store_motion(s, p, velocity, slope);
 }
 
 // Moves (l, o) of one axis by `step` cells; `leaves` is set within `slack` cells of the end of the
@@ -226,7 +227,7 @@ GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T
                                       const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
                                       T dt, ReturnMapped<T>& out) {
   T own[kViscousColumns];
-  load_viscous(s, p, own);
+  load_nine(s, s.viscous, p, own);
   const T share = own[6];
   T left = T(1);  // of the spring's strain
   if (out.plastic) {
@@ -281,9 +282,10 @@ struct ParticleBefore {
   Sym3<T> strain;
   T alpha, peak;
   uint32_t meta, row;
+  T velocity[3], own[9];  // of points that keep a share of their own motion
 };
 
-template <typename T, int kLaws>
+template <typename T, int kLaws, bool kKeeps = false>
 GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_t p) {
   ParticleBefore<T> b;
   b.meta = load_place(s, p, b.offset);
@@ -293,7 +295,21 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
     b.alpha = s.alpha[p];
     b.peak = s.peak[p];
   }
+  if constexpr (kKeeps) {
+    load_speed(s, p, b.velocity);
+    load_nine(s, s.own, p, b.own);
+  }
   return b;
+}
+
+// Of its own motion, leaves the share that a particle keeps of what the transfer alone would take:
+// it gathered `value` and `first` from nodes on which nothing acts but what `own` gave to them.
+template <typename T>
+GSF_HOST_DEVICE void leave_share(const SolverView<T>& s, const T* value, const Mat3<T>& first,
+                                 ParticleBefore<T>& b) {
+  const T mass = s.rows[int64_t(b.row) * kRowColumns + kMassColumn], scale = T(4) * s.inv_dx;
+  for (int i = 0; i < 3; ++i) b.velocity[i] = s.flip * (b.velocity[i] - value[i]);
+  for (int i = 0; i < 9; ++i) b.own[i] = s.flip * (b.own[i] - mass * (scale * first.m[i]));
 }
 
 // Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose
@@ -305,12 +321,12 @@ GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
 // `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
-// kKeeps: with keep_own.
+// kKeeps: with keep_own, and `before` holds what leave_share left.
 template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
-                                          const ParticleBefore<T>& before, uint32_t reach,
-                                          const T* value, const Mat3<T>& first, T dt, T dt_next,
-                                          bool waves, T slack, Largest& largest) {
+                                          ParticleBefore<T>& before, uint32_t reach, const T* value,
+                                          const Mat3<T>& first, T dt, T dt_next, bool waves,
+                                          T slack, Largest& largest) {
   StepFlags flags{};
   const T inv_dx = s.inv_dx;
   const uint32_t meta = before.meta, row = before.row;
@@ -329,9 +345,9 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
 
   if constexpr (kTrack) {
     Mat3<T> f;
-    load_deformation(s, p, f.m);
+    load_nine(s, s.deformation, p, f.m);
     f = f + dt * matmul(c, f);
-    store_deformation(s, p, f.m);
+    store_nine(s, s.deformation, p, f.m);
   }
 
   const T* r = s.rows + int64_t(row) * kRowColumns;
@@ -381,10 +397,15 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   }
   T slope[9];
   store_slope(slope, c, stress, r, dt_next);
-  if constexpr (kKeeps)
-    keep_own(s, p, c, r[kMassColumn], value, dt, slope);
-  else
+  const T* velocity = value;
+  if constexpr (kKeeps) {
+    keep_own(s, p, c, r[kMassColumn], value, dt, before.velocity, before.own, slope);
+    velocity = before.velocity;
+    const T own = momentum_bound(velocity, before.own, r[kMassColumn], s.dx);
+    largest.bound = larger(float(own), largest.bound);
+  } else {
     store_motion(s, p, value, slope);
+  }
 
   const T speed2 = value[0] * value[0] + value[1] * value[1] + value[2] * value[2];
   largest.speed2 = larger(float(speed2), largest.speed2);
@@ -394,7 +415,8 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     largest.wave2 = larger(float(wave2), largest.wave2);
     if (whole) largest.gradient2 = larger(float(gradient2), largest.gradient2);
   }
-  largest.bound = larger(float(momentum_bound(value, slope, r[kMassColumn], s.dx)), largest.bound);
+  largest.bound =
+      larger(float(momentum_bound(velocity, slope, r[kMassColumn], s.dx)), largest.bound);
   return flags;
 }
 
@@ -403,9 +425,10 @@ template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p, uint32_t reach,
                                           const T* value, const Mat3<T>& first, T dt, T dt_next,
                                           Largest& largest) {
-  return finish_particle<T, kLaws, kTrack, kKeeps>(
-      s, p, particle_before<T, kLaws>(s, p), reach, value, first, dt, dt_next,
-      measures_waves(*s.clock, kLaws), T(s.clock->slack), largest);
+  ParticleBefore<T> before = particle_before<T, kLaws, kKeeps>(s, p);
+  return finish_particle<T, kLaws, kTrack, kKeeps>(s, p, before, reach, value, first, dt, dt_next,
+                                                   measures_waves(*s.clock, kLaws),
+                                                   T(s.clock->slack), largest);
 }
 
 // Start of a call: the slope holds m C (the last step of the call before wrote it with dt_next =
@@ -422,6 +445,11 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   Mat3<T> c;
   T v[3];
   load_motion(s, p, v, c.m);
+  T bound = T(0);
+  if (!measure && s.own != nullptr) {  // m C, still without stress
+    store_nine(s, s.own, p, c.m);
+    bound = momentum_bound(v, c.m, mass, s.dx);
+  }
   const T inverse = mass > T(0) ? T(1) / mass : T(0);
   for (int i = 0; i < 9; ++i) c.m[i] *= inverse;
   if (measure) {
@@ -451,7 +479,8 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   T slope[9];
   store_slope(slope, c, state.stress, r, dt);
   store_motion(s, p, v, slope);
-  largest.bound = larger(float(momentum_bound(v, slope, mass, s.dx)), largest.bound);
+  bound = larger(momentum_bound(v, slope, mass, s.dx), bound);
+  largest.bound = larger(float(bound), largest.bound);
 }
 
 }  // namespace gsf

@@ -196,17 +196,25 @@ struct SolverView {
   const int32_t* parent;  // [fields] body of each field
   const int32_t* cut;     // [fields] its sides (core/collider/blade.h)
   // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
-  // null: colliders hold nodes; CPU only
+  // null: colliders hold nodes
   const T* radius;
   // [N, 9] viscosity of each point (core/material/viscous.h), or null
   T* viscous;
   // [fields] object of each field: points of different ones push each other
-  // (core/collider/touch.h); or null: fields meet at nodes; CPU only
+  // (core/collider/touch.h); or null: fields meet at nodes
   const int32_t* object;
   // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the share of their
-  // own motion that points keep in a step (cpu/mpm/flip.h); or null and 0; CPU only
+  // own motion that points keep in a step (leave_share); or null and 0
   T* own;
   T flip;
+  // of scenes with one of these three, on CUDA: node velocities of the pass without forces; volume
+  // [cells] and stiffness [Pa] of the points of each row, the fastest P-wave and the largest
+  // stiffness, and the largest that colliders and other points give to a point in this step, as
+  // bits; what they give to the points about a node, in units
+  T* free_velocity;     // [S, 64, 4]
+  double* spring_rows;  // [rows + 2, 2]
+  int64_t* push;        // [S, 64, 4]
+  int64_t* press;       // [S, 64, 4]
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {
@@ -217,11 +225,8 @@ struct SolverView {
     return parent != nullptr && parent[a] == parent[b] && !cut_apart(cut[a], cut[b]);
   }
   GSF_HOST_DEVICE bool touches_by_points(int32_t a, int32_t b) const {
-#ifdef __CUDA_ARCH__
-    return false;
-#else
-    return object != nullptr && object[a] != object[b];
-#endif
+    return object != nullptr && uint32_t(a) < uint32_t(fields) && uint32_t(b) < uint32_t(fields) &&
+           object[a] != object[b];
   }
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }

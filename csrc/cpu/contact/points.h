@@ -1,8 +1,7 @@
 // Points of the resident solver that points of other bodies push: core/collider/touch.h.
 #pragma once
 
-#include "core/collider/touch.h"
-#include "core/solver/node.h"
+#include "core/solver/points.h"
 #include "cpu/solver/contact.h"
 #include "cpu/solver/surface.h"
 
@@ -69,11 +68,10 @@ class TouchPlan {
     int32_t point, home, next;  // next: of its cell
     bool pushed;
     double x[3], v[3];  // place in cells and velocity in cells per second
-    double volume;      // in cells
-    double stiffness;   // K [Pa]
-    double share;       // of other bodies at which it touches
-    double lag;         // time of the damping [s]
-    double energy;      // V dE/df [Pa cells]
+    TouchMatter matter;
+    double share;   // of other bodies at which it touches
+    double lag;     // time of the damping [s]
+    double energy;  // V dE/df [Pa cells]
   };
   // Cell of a slot with such points.
   struct Cell {
@@ -115,13 +113,10 @@ class TouchPlan {
         }
         const int32_t slot = s_.neighbour[kNeighbours * h + block];
         if (slot < 0 || slot >= s_.clock->slots) continue;
-        const T* r = s_.rows + int64_t(s_.row_of(meta)) * kRowColumns;
-        const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
+        const uint32_t row = s_.row_of(meta);
         const double radius = double(s_.radius[s_.id[p]]) / dx;
-        const double wave = row_wave(s_, s_.row_of(meta));
-        item.volume = mass * thin / (dx * dx * dx);
-        item.stiffness = touch_stiffness(1.0 / thin, wave, std::cbrt(mass * thin), dx, step_);
-        item.lag = spring_lag(wave, dx);
+        item.matter = touch_matter(s_, row, step_);
+        item.lag = spring_lag(row_wave(s_, row), dx);
         item.share = touch_share(radius);
         int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
         if (first < 0) {
@@ -184,20 +179,13 @@ class TouchPlan {
     for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
          i = items_[i].next) {
       Item& p = items_[i];
-      double share = 0.0, stiffness = 0.0, rate = 0.0;
+      TouchFound found{};
       if (cell.meets)
         each_near(p, others, [&](const Item& q, const double* d, double r2) {
-          const double found = q.volume * touch_kernel(r2);
-          share += found;
-          stiffness += found * q.stiffness;
-          for (int axis = 0; axis < 3; ++axis)
-            rate += q.volume * touch_gradient(r2) * d[axis] * (p.v[axis] - q.v[axis]);
+          add_found(q.matter, d, r2, p.v, q.v, found);
         });
-      const double over = share - p.share;
       p.pushed = false;
-      p.energy = over > 0.0 ? p.volume * std::max(0.0, over + p.lag * rate) *
-                                  std::min(p.stiffness, stiffness / share)
-                            : 0.0;
+      p.energy = touch_energy(p.matter, p.share, p.lag, found);
     }
   }
 
@@ -205,23 +193,16 @@ class TouchPlan {
   void push(const Cell& cell, std::vector<int32_t>& others) {
     if (!cell.meets) return;
     gather(cell, others);
-    const double dx = double(s_.dx), scale = -s_.clock->dt * dx * dx;
     for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
          i = items_[i].next) {
       Item& p = items_[i];
       double sum[3] = {};
       each_near(p, others, [&](const Item& q, const double* d, double r2) {
-        const double f = (p.energy * q.volume + q.energy * p.volume) * touch_gradient(r2);
+        const double f = touch_force(p.energy, p.matter.volume, q.energy, q.matter.volume, r2);
         for (int axis = 0; axis < 3; ++axis) sum[axis] += f * d[axis];
       });
-      T* out = given_.data() + 4 * int64_t(p.point);
-      double length = 0.0;
-      for (int axis = 0; axis < 3; ++axis) {
-        out[axis] = T(scale * sum[axis]);
-        length += sum[axis] * sum[axis];
-      }
-      out[3] = T(std::abs(scale) * std::sqrt(length));
-      p.pushed = length > 0.0;
+      touch_given(sum, s_.clock->dt, double(s_.dx), given_.data() + 4 * int64_t(p.point));
+      p.pushed = sum[0] != 0.0 || sum[1] != 0.0 || sum[2] != 0.0;
     }
   }
 

@@ -1,7 +1,7 @@
 // Nodes of the resident solver on the CPU: sums to velocities, contact, colliders, site by site.
 #pragma once
 
-#include "core/solver/node.h"
+#include "core/solver/points.h"
 #include "cpu/contact/points.h"
 #include "cpu/solver/surface.h"
 
@@ -127,27 +127,32 @@ class NodePass {
       present += heavy[a] ? 1 : 0;
     }
     const auto number = [&](int f) { return s_.slot_coord[4 * int64_t(site.slots[f]) + 3]; };
+    const auto weight = [&](int field) { return mass[field]; };
     int64_t contacts = 0;
     if (present > 1) {
       const auto near = [&](int field, int o) {
         return contact_.sample(site.slots[field], local, o);
       };
-      const auto weight = [&](int field) { return mass[field]; };
       contacts = node_contact(s_, fields, heavy, number, weight, near, velocity) > 0 ? 1 : 0;
     }
     if (present > 1 && (marks & kTouchedPoints) != 0)
-      hold(site, local, heavy, number, mass, velocity);
+      node_hold(s_, fields, heavy, number, weight, given(site, local, touch_.sums()), velocity);
+    const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
     if (site.colliders > 0 && present > 0) {
-      const Vec3<T> x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
       for (int64_t i = 0; i < site.colliders; ++i) {
         const int32_t k = site.collider(i);
         for (int a = 0; a < fields; ++a)
-          if (heavy[a] && holds(k, x))
+          if (heavy[a] && holds_node(s_, k, x))
             node_collide(s_, k, x, mass[a], node_cut(s_, fields, heavy, number, a), dt, velocity[a],
                          impulse + kImpulseSums * k);
       }
     }
-    if ((marks & kTouchedPush) != 0) rub(site, local, heavy, number, mass, velocity, impulse);
+    if ((marks & kTouchedPush) != 0) {
+      const auto nearest = [&] { return surface_.nearest(x); };
+      const auto account = [&](int64_t k) { return impulse + kImpulseSums * k; };
+      node_rub(s_, fields, heavy, number, weight, given(site, local, surface_.sums()), x, nearest,
+               account, velocity);
+    }
     for (int a = 0; a < fields; ++a) {
       T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
       for (int i = 0; i < 3; ++i) out[i] = velocity[a][i];
@@ -156,109 +161,11 @@ class NodePass {
     return contacts;
   }
 
-  // Whether collider k acts on nodes at x: one that pushes points does so far behind its surface.
-  bool holds(int64_t k, const Vec3<T>& x) const {
-    const T* row = s_.colliders + k * kColliderColumns;
-    if (!surface_.any() || !collider_springs(row)) return true;
-    Vec3<T> normal;
-    return collider_signed_distance(row, s_.sdf, x, normal) <= T(-kSpringNode) * s_.dx;
-  }
-
-  // Friction between the objects whose points about a node push each other. Fields that move as one
-  // rub as one.
-  template <typename Number>
-  void hold(const Site& site, int local, const bool* heavy, const Number& number,
-            const double* mass, Vec3<T>* velocity) const {
-    struct Group {
-      uint32_t fields = 0;
-      int first = 0;
-      double mass = 0.0, push[4] = {};
-    } groups[kSiteFields];
-    int count = 0;
-    uint32_t done = 0;
-    for (int a = 0; a < site.fields; ++a) {
-      if (!heavy[a] || (done >> a & 1u) != 0) continue;
-      Group& group = groups[count++];
-      group.first = a;
-      group.fields = node_group(s_, site.fields, heavy, number, a);
-      done |= group.fields;
-      for (int f = 0; f < site.fields; ++f) {
-        if ((group.fields >> f & 1u) == 0) continue;
-        const T* given = touch_.sums() + 4 * (int64_t(site.slots[f]) * kBlockNodes + local);
-        for (int c = 0; c < 4; ++c) group.push[c] += double(given[c]);
-        group.mass += mass[f];
-      }
-    }
-    for (int i = 0; i < count; ++i)
-      for (int j = i + 1; j < count; ++j) {
-        const Group &a = groups[i], &b = groups[j];
-        if (!s_.touches_by_points(number(a.first), number(b.first))) continue;
-        Vec3<double> push, relative;
-        for (int c = 0; c < 3; ++c) {
-          push[c] = a.push[c] - b.push[c];
-          relative[c] = double(velocity[a.first][c]) - double(velocity[b.first][c]);
-        }
-        const Vec3<double> along =
-            touch_friction(push, relative, s_.contact.friction * 0.5 * (a.push[3] + b.push[3]),
-                           a.mass / (a.mass + b.mass) * b.mass);
-        for (int f = 0; f < site.fields; ++f)
-          for (int c = 0; c < 3; ++c) {
-            if (a.fields >> f & 1u) velocity[f][c] -= T(along[c] / a.mass);
-            if (b.fields >> f & 1u) velocity[f][c] += T(along[c] / b.mass);
-          }
-      }
-  }
-
-  // Friction of the points about a node that colliders pushed, and what those gave: on the account
-  // of the nearest of them. Fields that move as one rub as one.
-  template <typename Number>
-  void rub(const Site& site, int local, const bool* heavy, const Number& number, const double* mass,
-           Vec3<T>* velocity, double* impulse) const {
-    Vec3<T> x;
-    int32_t k = -1;
-    uint32_t done = 0;
-    for (int a = 0; a < site.fields; ++a) {
-      const T* given = surface_.sums() + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
-      if (given[0] == T(0) && given[1] == T(0) && given[2] == T(0)) done |= 1u << a;
-    }
-    if (done == (1u << site.fields) - 1u) return;
-    done = 0;
-    for (int a = 0; a < site.fields; ++a) {
-      if (!heavy[a] || (done >> a & 1u) != 0) continue;
-      const uint32_t group = node_group(s_, site.fields, heavy, number, a);
-      done |= group;
-      double total = 0.0;
-      T push[4] = {};
-      for (int f = 0; f < site.fields; ++f) {
-        if ((group >> f & 1u) == 0) continue;
-        const T* given = surface_.sums() + 4 * (int64_t(site.slots[f]) * kBlockNodes + local);
-        for (int c = 0; c < 4; ++c) push[c] += given[c];
-        total += mass[f];
-      }
-      const Vec3<T> j{push[0], push[1], push[2]};
-      if (!(dot(j, j) > T(0))) continue;
-      if (k < 0) {
-        x = node_position(site.slots[0], T(local / 16), T(local / 4 % 4), T(local % 4));
-        k = surface_.nearest(x);
-      }
-      const T* row = s_.colliders + int64_t(k) * kColliderColumns;
-      const Vec3<T> v = velocity[a];
-      const Vec3<T> after = spring_friction(v, collider_velocity(row, x), j, push[3], T(total));
-      double given[3], arm[3];
-      for (int i = 0; i < 3; ++i) {
-        given[i] = double(j[i]) + total * (double(after[i]) - double(v[i]));
-        arm[i] = double(x[i]) - double(row[kPoint + i]);
-      }
-      double* sums = impulse + kImpulseSums * k;
-      for (int i = 0; i < 3; ++i) {
-        sums[i] += given[i];
-        sums[3 + i] +=
-            arm[(i + 1) % 3] * given[(i + 2) % 3] - arm[(i + 2) % 3] * given[(i + 1) % 3];
-      }
-      sums[6] += total;
-      for (int f = 0; f < site.fields; ++f)
-        if (group >> f & 1u) velocity[f] = velocity[f] + (after - v);
-    }
+  // Sums of pushes at a node by field and component.
+  static auto given(const Site& site, int local, const T* sums) {
+    return [&site, local, sums](int f, int c) {
+      return sums[4 * (int64_t(site.slots[f]) * kBlockNodes + local) + c];
+    };
   }
 
   const SolverView<T>& s_;

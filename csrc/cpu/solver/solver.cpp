@@ -112,7 +112,6 @@ struct Cpu {
     prime_particles(s, laws, true);
     start_clock(c, double(s.dx));
     if (c.done != 0 || c.reason != kFine) return;
-    if (s.own != nullptr) std::copy_n(s.slope, 9 * s.count, s.own);  // m C, still without stress
     prime_particles(s, laws, false);
     choose_unit(c);
   }

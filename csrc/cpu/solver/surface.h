@@ -1,28 +1,17 @@
 // Points of the resident solver that rigid colliders push: core/collider/spring.h.
 #pragma once
 
-#include "core/collider/spring.h"
-#include "core/solver/node.h"
+#include "core/solver/points.h"
 #include "cpu/solver/packet.h"
 
 namespace gsf::cpu {
 
-// P-wave speed of a row at rest [m/s].
-template <typename T>
-double row_wave(const SolverView<T>& s, int64_t row) {
-  const T* r = s.rows + row * kRowColumns;
-  return double(r[kPaceColumn]) * double(r[kInverseDensityColumn]) /
-         (kSlowUnloading * double(s.dx));
-}
-
-// Step [s] that springs of points must bear: the longest at rest. Not the present one: a spring
-// that is stiffer in a short step gives back more than it took.
+// The step that springs of points must bear [s].
 template <typename T>
 double spring_step(const SolverView<T>& s) {
-  const SolverClock& c = *s.clock;
   double wave = 0.0;
   for (int64_t row = 0; row < s.row_count; ++row) wave = std::max(wave, row_wave(s, row));
-  return c.dt_fixed > 0.0 ? c.dt_fixed : c.cfl * double(s.dx) / std::max(wave, 1e-30);
+  return spring_step(*s.clock, wave, double(s.dx));
 }
 
 template <typename T>
@@ -34,11 +23,8 @@ class SurfacePlan {
   void make() {
     const SolverClock& c = *s_.clock;
     springs_.clear();
-    for (int64_t k = 0; s_.radius != nullptr && k < s_.collider_count; ++k) {
-      const double* row = s_.collider_state + k * kColliderColumns;
-      if (collider_valid(row, s_.sdf_count) && collider_springs(row))
-        springs_.push_back(static_cast<int32_t>(k));
-    }
+    for (int64_t k = 0; s_.radius != nullptr && k < s_.collider_count; ++k)
+      if (pushes_points(s_, k)) springs_.push_back(static_cast<int32_t>(k));
     step_ = spring_step(s_);
     near_.assign(springs_.empty() ? 0 : c.homes, 0);
     push_.assign(springs_.empty() ? 0 : c.slots * kBlockNodes * 4, T(0));
@@ -55,7 +41,7 @@ class SurfacePlan {
   // False when none gets any.
   bool pushes(int64_t h, const int32_t* entry, int64_t count, std::vector<T>& out) const {
     const int32_t* b = s_.homes().coord + 4 * h;
-    const double dx = double(s_.dx), dt = s_.clock->dt;
+    const double dx = double(s_.dx);
     bool any = false, close = false;
     uint32_t cell = ~0u;
     out.assign(4 * count, T(0));
@@ -70,29 +56,14 @@ class SurfacePlan {
         close = reaches(middle, (0.87 + kSpringReach) * dx);
       }
       if (!close) continue;
-      Vec3<double> x;
+      PushedPoint<T> point;
       for (int axis = 0; axis < 3; ++axis)
-        x[axis] =
+        point.x[axis] =
             (4.0 * b[axis] - 0.5 + meta_cell(meta, axis) + double(s_.offset[3 * p + axis])) * dx;
-      const double radius = double(s_.radius[s_.id[p]]);
-      for (const int32_t k : springs_) {
-        const double* row = s_.collider_state + int64_t(k) * kColliderColumns;
-        Vec3<double> normal;
-        double depth = radius - collider_signed_distance(row, s_.sdf, x, normal);
-        if (!(depth > 0.0)) continue;
-        const T* r = s_.rows + int64_t(s_.row_of(meta)) * kRowColumns;
-        const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
-        const double wave = row_wave(s_, s_.row_of(meta));
-        const Vec3<double> own = collider_velocity(row, x);
-        double away = 0.0;
-        for (int axis = 0; axis < 3; ++axis)
-          away += normal[axis] * (double(s_.velocity[3 * p + axis]) - own[axis]);
-        depth = std::max(0.0, depth - spring_lag(wave, dx) * away);
-        const double gained = spring_speed(depth, wave, std::cbrt(mass * thin), dx, dt, step_);
-        for (int axis = 0; axis < 3; ++axis) out[4 * i + axis] += T(mass * gained * normal[axis]);
-        out[4 * i + 3] += T(row[kFriction] * mass * gained);
-        any = true;
-      }
+      load_speed(s_, p, point.velocity);
+      point.radius = double(s_.radius[s_.id[p]]);
+      point.row = s_.row_of(meta);
+      for (const int32_t k : springs_) any = push_point(s_, k, point, step_, &out[4 * i]) || any;
     }
     return any;
   }
@@ -102,30 +73,16 @@ class SurfacePlan {
   const T* sums() const { return push_.data(); }
 
   // The collider nearest to x.
-  int32_t nearest(const Vec3<T>& x) const {
-    int32_t found = springs_[0];
-    if (springs_.size() == 1) return found;
-    T least = T(INFINITY);
-    for (const int32_t k : springs_) {
-      Vec3<T> normal;
-      const T d =
-          collider_signed_distance(s_.colliders + int64_t(k) * kColliderColumns, s_.sdf, x, normal);
-      if (d < least) {
-        least = d;
-        found = k;
-      }
-    }
-    return found;
+  int64_t nearest(const Vec3<T>& x) const {
+    const int64_t count = static_cast<int64_t>(springs_.size());
+    return nearest_collider(s_, count, [&](int64_t i) { return springs_[i]; }, x);
   }
 
  private:
-  // Whether a point of home h may be pushed: they lie within 3 cells of its middle on each axis.
+  // Whether a point of home h may be pushed once a collider has come `more` cells nearer.
   bool within(int64_t h, double more) const {
-    const int32_t* b = s_.homes().coord + 4 * h;
-    const double dx = double(s_.dx);
-    const Vec3<double> middle{(4.0 * b[0] + 2.5) * dx, (4.0 * b[1] + 2.5) * dx,
-                              (4.0 * b[2] + 2.5) * dx};
-    return reaches(middle, (5.2 + kSpringReach + more) * dx);
+    const Vec3<double> middle = home_middle(s_, s_.homes().coord + 4 * h);
+    return reaches(middle, home_reach(s_) + more * double(s_.dx));
   }
   // Whether a collider that pushes points is nearer to x than `far`.
   bool reaches(const Vec3<double>& x, double far) const {

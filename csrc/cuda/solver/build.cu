@@ -276,7 +276,12 @@ __global__ void __launch_bounds__(kThreads) stripe_kernel(const __grid_constant_
 }
 
 // What one pass of the re-sort carries through `spare`, nine columns at most.
-enum Pass : int { kPlacePass, kMotionPass, kStrainPass, kDeformationPass, kViscousPass };
+enum Pass : int { kPlacePass, kMotionPass, kStrainPass, kDeformationPass, kViscousPass, kOwnPass };
+
+template <typename T>
+GSF_HOST_DEVICE T* nine_of(const SolverView<T>& s, int pass) {
+  return pass == kDeformationPass ? s.deformation : (pass == kViscousPass ? s.viscous : s.own);
+}
 
 // Calls f(array) for the arrays of a pass, the widest elements first.
 template <typename T, typename F>
@@ -299,7 +304,7 @@ __device__ void for_pass(const SolverView<T>& s, int pass, F&& f) {
     }
   }
   if (pass >= kDeformationPass) {
-    T* nine = pass == kDeformationPass ? s.deformation : s.viscous;
+    T* nine = nine_of(s, pass);
     f(quad_plane(s, nine, 0));
     f(quad_plane(s, nine, 1));
     f(nine + 8 * s.count);
@@ -375,9 +380,8 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream) {
   place_kernel<T><<<homes, kThreads, 0, stream>>>(s);
   invert_kernel<T><<<ctas(s.count), kThreads, 0, stream>>>(s);
   stripe_kernel<T><<<homes, kThreads, 0, stream>>>(s);
-  for (int pass = kPlacePass; pass <= kViscousPass; ++pass) {
-    if (pass == kDeformationPass && s.deformation == nullptr) continue;
-    if (pass == kViscousPass && s.viscous == nullptr) continue;
+  for (int pass = kPlacePass; pass <= kOwnPass; ++pass) {
+    if (pass >= kDeformationPass && nine_of(s, pass) == nullptr) continue;
     carry_kernel<T, false><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
     carry_kernel<T, true><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
   }

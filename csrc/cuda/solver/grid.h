@@ -1,12 +1,15 @@
 // Nodes of the resident solver: sums to velocities, contact between fields, colliders.
 #pragma once
 
+#include "core/solver/clock.h"
+#include "core/solver/points.h"
 #include "cuda/solver/reduce.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kGridCtas = 5;  // of a multiprocessor, for grid_kernel's registers
+constexpr int kGridCtas = 5;            // of a multiprocessor, for grid_kernel's registers
+constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 
 // Reads the sums of one node.
 template <typename T>
@@ -79,9 +82,24 @@ struct HeldSums {
   }
 };
 
+// Books what the lanes of a warp got from collider k.
+template <typename T>
+__device__ __forceinline__ void book(const SolverView<T>& s, HeldSums& held, int64_t k,
+                                     const double* sums) {
+  const double units_of[3] = {1.0 / sum_unit(s, 0), 1.0 / sum_unit(s, 3), 1.0 / sum_unit(s, 6)};
+  for (int i = 0; i < kImpulseSums; ++i) {
+    const long long units = warp_sum(__double2ll_rn(sums[i] * units_of[i / 3]));
+    if (units == 0 || (threadIdx.x & 31) != 0) continue;
+    if (k < kHeldColliders)
+      add_units(held.units + kImpulseSums * k + i, units);
+    else
+      add_units(s.impulse_units + kImpulseSums * k + i, units);
+  }
+}
+
 // Velocity after the colliders in `near`, for all lanes of a warp together (`near` is the same in
 // all). Out of line: few nodes come here.
-template <typename T>
+template <typename T, bool kPoints>
 __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& held, uint64_t near,
                                              bool active, Vec3<T> x, double mass, int32_t cut,
                                              Vec3<T> v, T dt) {
@@ -90,39 +108,30 @@ __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& h
     const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
     for (int64_t k = first; k < end; ++k) {
       double sums[kImpulseSums] = {};
-      if (active) node_collide(s, k, x, mass, cut, dt, v, sums);
+      if (active && (!kPoints || holds_node(s, k, x)))
+        node_collide(s, k, x, mass, cut, dt, v, sums);
       if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
-      const double units_of[3] = {1.0 / sum_unit(s, 0), 1.0 / sum_unit(s, 3), 1.0 / sum_unit(s, 6)};
-      for (int i = 0; i < kImpulseSums; ++i) {
-        const long long units = warp_sum(__double2ll_rn(sums[i] * units_of[i / 3]));
-        if (units == 0 || (threadIdx.x & 31) != 0) continue;
-        if (k < kHeldColliders)
-          add_units(held.units + kImpulseSums * k + i, units);
-        else
-          add_units(s.impulse_units + kImpulseSums * k + i, units);
-      }
+      book(s, held, k, sums);
     }
   }
   return v;
 }
 
 // Velocities are stored in fours, so that a node is read and written at once.
-__device__ inline void store_velocity(const SolverView<float>& s, int64_t node,
-                                      const Vec3<float>& v) {
-  reinterpret_cast<float4*>(s.node_velocity)[node] = {v.x, v.y, v.z, 0.0f};
+__device__ inline void store_velocity(float* velocity, int64_t node, const Vec3<float>& v) {
+  reinterpret_cast<float4*>(velocity)[node] = {v.x, v.y, v.z, 0.0f};
 }
-__device__ inline void store_velocity(const SolverView<double>& s, int64_t node,
-                                      const Vec3<double>& v) {
-  double2* out = reinterpret_cast<double2*>(s.node_velocity) + 2 * node;
+__device__ inline void store_velocity(double* velocity, int64_t node, const Vec3<double>& v) {
+  double2* out = reinterpret_cast<double2*>(velocity) + 2 * node;
   out[0] = {v.x, v.y};
   out[1] = {v.z, 0.0};
 }
-__device__ inline Vec3<float> load_velocity(const SolverView<float>& s, int64_t node) {
-  const float4 v = reinterpret_cast<const float4*>(s.node_velocity)[node];
+__device__ inline Vec3<float> load_velocity(const float* velocity, int64_t node) {
+  const float4 v = reinterpret_cast<const float4*>(velocity)[node];
   return {v.x, v.y, v.z};
 }
-__device__ inline Vec3<double> load_velocity(const SolverView<double>& s, int64_t node) {
-  const double2* v = reinterpret_cast<const double2*>(s.node_velocity) + 2 * node;
+__device__ inline Vec3<double> load_velocity(const double* velocity, int64_t node) {
+  const double2* v = reinterpret_cast<const double2*>(velocity) + 2 * node;
   const double2 low = v[0], high = v[1];
   return {low.x, low.y, high.x};
 }
@@ -131,6 +140,81 @@ template <typename T>
 __device__ Vec3<T> node_place(const int32_t* block, T x, T y, T z, T dx) {
   return {(T(block[0]) * T(kBlockEdge) + x) * dx, (T(block[1]) * T(kBlockEdge) + y) * dx,
           (T(block[2]) * T(kBlockEdge) + z) * dx};
+}
+
+// What colliders (`push`) or points of other objects (`press`) give to the points about a node:
+// fixed-point sums. Their unit is that of clock.h for momentum, of the largest number that a point
+// of this step is given; its bits stand behind the rows of `spring_rows`.
+enum Given : int { kPush, kPress };
+template <typename T>
+__device__ uint64_t* given_bound(const SolverView<T>& s, int which) {
+  return reinterpret_cast<uint64_t*>(s.spring_rows + 2 * (s.row_count + 1)) + which;
+}
+template <typename T>
+__device__ double given_unit(const SolverView<T>& s, int which) {
+  const double bound = float_of_bits(*given_bound(s, which));
+  return ldexp(power_above(fmax(bound, 1e-30)), -int(s.clock->unit_bits));
+}
+__device__ inline double read_given(const int64_t* sums, double unit, int64_t node, int c) {
+  return sums == nullptr ? 0.0 : double(sums[4 * node + c]) * unit;
+}
+__device__ inline void clear_given(int64_t* sums, int64_t node) {
+  if (sums == nullptr) return;
+  longlong2* words = reinterpret_cast<longlong2*>(sums + 4 * node);
+  const longlong2 a = words[0], b = words[1];
+  if ((a.x | a.y | b.x | b.y) != 0) words[0] = words[1] = longlong2{0, 0};
+}
+
+// Sums of a node with what its points are given.
+template <typename T, bool kPoints>
+__device__ __forceinline__ NodeSums<T> read_all(const SolverView<T>& s, int64_t node) {
+  NodeSums<T> sums = read_sums(s, node);
+  if constexpr (kPoints) {
+    const double push = given_unit(s, kPush), press = given_unit(s, kPress);
+    for (int c = 0; c < 3; ++c)
+      sums.momentum[c] += read_given(s.push, push, node, c) + read_given(s.press, press, node, c);
+  }
+  return sums;
+}
+
+// Friction where points of different objects push each other. Out of line, as collide_near.
+template <typename T, typename Number, typename Mass, typename Node>
+__device__ __noinline__ void hold_near(const SolverView<T>& s, int fields, const bool* heavy,
+                                       const Number& number, const Mass& mass, const Node& node,
+                                       Vec3<T>* velocity) {
+  bool any = false;
+  for (int f = 0; f < fields; ++f)
+    for (int c = 0; c < 3; ++c) any = any || s.press[4 * node(f) + c] != 0;
+  if (!any) return;
+  const double unit = given_unit(s, kPress);
+  const auto press = [&](int f, int c) { return T(read_given(s.press, unit, node(f), c)); };
+  node_hold(s, fields, heavy, number, mass, press, velocity);
+}
+
+// Friction where colliders push points, for all lanes of a warp together: node(f) is that of the
+// f-th field. Out of line likewise.
+template <typename T, typename Number, typename Mass, typename Node>
+__device__ __noinline__ void rub_near(const SolverView<T>& s, HeldSums& held, int fields,
+                                      const bool* heavy, const Number& number, const Mass& mass,
+                                      const Node& node, const Vec3<T>& x, Vec3<T>* velocity) {
+  double sums[kImpulseSums] = {};
+  int64_t k = -1;
+  const double unit = given_unit(s, kPush);
+  const auto push = [&](int f, int c) { return T(read_given(s.push, unit, node(f), c)); };
+  const auto which = [&](int64_t i) { return pushes_points(s, i) ? i : int64_t(-1); };
+  const auto nearest = [&] { return nearest_collider(s, s.collider_count, which, x); };
+  const auto account = [&](int64_t one) {
+    k = one;
+    return sums;
+  };
+  node_rub(s, fields, heavy, number, mass, push, x, nearest, account, velocity);
+  for (unsigned left = __ballot_sync(kAllLanes, k >= 0); left != 0;) {
+    const int64_t one = __shfl_sync(kAllLanes, static_cast<long long>(k), __ffs(left) - 1);
+    double own[kImpulseSums];
+    for (int i = 0; i < kImpulseSums; ++i) own[i] = k == one ? sums[i] : 0.0;
+    book(s, held, one, own);
+    left &= ~__ballot_sync(kAllLanes, k == one);
+  }
 }
 
 // What contact reads around the nodes of a block: sums of all slots that hold moments. Those of the
@@ -172,7 +256,7 @@ struct SlotNear {
 
 // Velocities of the sites that several fields share; `table_mask` lists them. Before grid_kernel,
 // which clears the sums that this one reads, its own and those of the nodes around.
-template <typename T>
+template <typename T, bool kPoints>
 __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t site, HeldSums& held) {
   const SolverClock& clock = *s.clock;
   __shared__ int32_t around[kSiteFields][kNeighbours];
@@ -206,28 +290,32 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   int present = 0;
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
-    heavy[f] = node_velocity(s, read_sums(s, node), dt, velocity[f]);
+    heavy[f] = node_velocity(s, read_all<T, kPoints>(s, node), dt, velocity[f]);
     present += heavy[f] ? 1 : 0;
   }
   int touched = 0;
   const auto number = [&](int f) { return s.slot_coord[4 * int64_t(slots[f]) + 3]; };
-  if (present > 1) {
-    const auto mass = [&](int f) {
-      return read_sums(s, int64_t(slots[f]) * kBlockNodes + local).mass;
-    };
-    touched = node_contact(s, count, heavy, number, mass, near_nodes, velocity);
-  }
+  const auto node_of = [&](int f) { return int64_t(slots[f]) * kBlockNodes + local; };
+  const auto mass = [&](int f) { return read_sums(s, node_of(f)).mass; };
+  if (present > 1) touched = node_contact(s, count, heavy, number, mass, near_nodes, velocity);
+  if constexpr (kPoints)
+    if (present > 1 && s.press != nullptr)
+      hold_near(s, count, heavy, number, mass, node_of, velocity);
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
     if (near != 0)
-      velocity[f] = collide_near(s, held, near, heavy[f], x, read_sums(s, node).mass,
-                                 node_cut(s, count, heavy, number, f), velocity[f], dt);
-    store_velocity(s, node, velocity[f]);
+      velocity[f] = collide_near<T, kPoints>(s, held, near, heavy[f], x, read_sums(s, node).mass,
+                                             node_cut(s, count, heavy, number, f), velocity[f], dt);
+    if constexpr (!kPoints) store_velocity(s.node_velocity, node, velocity[f]);
+  }
+  if constexpr (kPoints) {
+    if (s.collider_count > 0) rub_near(s, held, count, heavy, number, mass, node_of, x, velocity);
+    for (int f = 0; f < count; ++f) store_velocity(s.node_velocity, node_of(f), velocity[f]);
   }
   if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
 }
 
-template <typename T>
+template <typename T, bool kPoints>
 __global__ void __launch_bounds__(kBlockNodes)
     contact_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
@@ -236,7 +324,7 @@ __global__ void __launch_bounds__(kBlockNodes)
   held.clear();
   __syncthreads();
   for (int64_t i = blockIdx.x; i < clock.shared_sites; i += gridDim.x) {
-    contact_site(s, s.table_mask[i], held);
+    contact_site<T, kPoints>(s, s.table_mask[i], held);
     __syncthreads();  // what lies in shared memory is used again
   }
   held.hand_over(s);
@@ -244,15 +332,21 @@ __global__ void __launch_bounds__(kBlockNodes)
 
 // Velocities of the nodes of one slot, where its field is alone; those of shared sites are done by
 // contact_kernel, only their sums are cleared.
-template <typename T>
+template <typename T, bool kPoints>
 __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot) {
   const int local = threadIdx.x % kBlockNodes;
   const int64_t node = slot * kBlockNodes + local;
   const int32_t shared = s.moments != nullptr ? s.slot_shared[slot] : 0;
   const uint64_t near = s.collider_count > 0 ? s.slot_near[slot] : 0;
-  const NodeSums<T> sums = read_sums(s, node);
+  const NodeSums<T> sums = read_all<T, kPoints>(s, node);
   clear_sums(s, node, shared);
-  if (shared == 1) return;
+  if (shared == 1) {
+    if constexpr (kPoints) {
+      clear_given(s.push, node);
+      clear_given(s.press, node);
+    }
+    return;
+  }
   Vec3<T> v;
   const T dt = T(s.clock->dt);
   const bool heavy = node_velocity(s, sums, dt, v);
@@ -260,13 +354,24 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
     const Vec3<T> x =
         node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
     const int32_t cut = s.cut_of(s.slot_coord[4 * slot + 3]);
-    v = collide_near(s, held, near, heavy, x, sums.mass, cut, v, dt);
+    v = collide_near<T, kPoints>(s, held, near, heavy, x, sums.mass, cut, v, dt);
   }
-  store_velocity(s, node, v);
+  if constexpr (kPoints) {
+    if (s.collider_count > 0) {
+      const Vec3<T> x =
+          node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
+      const auto number = [&](int) { return s.slot_coord[4 * slot + 3]; };
+      const auto mass = [&](int) { return sums.mass; };
+      rub_near(s, held, 1, &heavy, number, mass, [&](int) { return node; }, x, &v);
+    }
+    clear_given(s.push, node);
+    clear_given(s.press, node);
+  }
+  store_velocity(s.node_velocity, node, v);
 }
 
-template <typename T>
-__global__ void __launch_bounds__(kSolverThreads, kGridCtas)
+template <typename T, bool kPoints>
+__global__ void __launch_bounds__(kSolverThreads, kPoints ? 2 : kGridCtas)
     grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
@@ -280,8 +385,21 @@ __global__ void __launch_bounds__(kSolverThreads, kGridCtas)
   // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
   const int64_t home = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
   if (home < clock.homes) s.home_bound[home] = T(0);
-  if (slot < clock.slots) update_slot(s, held, slot);
+  if (slot < clock.slots) update_slot<T, kPoints>(s, held, slot);
   if (s.collider_count > 0) held.hand_over(s);
+}
+
+// kPoints: of scenes whose points are pushed.
+template <typename T, bool kPoints>
+void launch_nodes(const SolverView<T>& s, cudaStream_t stream) {
+  constexpr int kSlotsPerCta = kSolverThreads / kBlockNodes;
+  if (s.moments != nullptr)
+    contact_kernel<T, kPoints>  // a shared site has two slots at least
+        <<<min(static_cast<unsigned>((s.slot_capacity + 1) / 2), kSharedCtas), kBlockNodes, 0,
+           stream>>>(s);
+  grid_kernel<T, kPoints>
+      <<<static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta), kSolverThreads,
+         0, stream>>>(s);
 }
 
 }  // namespace

@@ -14,7 +14,6 @@ namespace {
 // Threads of a CTA, and CTAs of a multiprocessor that registers must suffice for: measured on an
 // H100 (docs/measured/benchmarks.md).
 constexpr int kP2GThreads = 128, kP2GCtas = 8;
-constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 // Strides of the window in shared memory: 32 cells of half a block lie in 32 different banks.
 constexpr int kStrideX = 68, kStrideY = 8;
 constexpr int kTile = kWindowEdge * kStrideX;
@@ -114,15 +113,21 @@ struct ParticleGiven {
   T offset[3], velocity[3], slope[9];
   uint32_t meta;
 
+  template <bool kFree>
   __device__ void read(const SolverView<T>& s, int64_t p) {
     meta = load_place(s, p, offset);
-    load_motion(s, p, velocity, slope);
+    if constexpr (kFree) {
+      load_speed(s, p, velocity);
+      load_nine(s, s.own, p, slope);
+    } else {
+      load_motion(s, p, velocity, slope);
+    }
   }
 };
 
 // One home, or part of it. Where its window touches blocks that fields share, moments are summed
-// too.
-template <typename T, bool kMoments>
+// too. kFree: without the forces, from `own`.
+template <typename T, bool kMoments, bool kFree = false>
 __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, int part,
                                          int split_shift) {
   using Word = typename Fixed<T>::Word;
@@ -137,7 +142,8 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
   const int stride = kP2GThreads << split_shift;
   int64_t r = part * kP2GThreads + threadIdx.x;
   ParticleGiven<T> given;
-  if (first >= 0 && r < count) given.read(s, first + r);  // while the window is cleared
+  if (first >= 0 && r < count)
+    given.template read<kFree>(s, first + r);  // while the window is cleared
   for (int i = threadIdx.x; i < kChannels * kTile; i += kP2GThreads) (&tile[0][0])[i] = 0;
   if (threadIdx.x < kNeighbours) {
     const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
@@ -172,7 +178,7 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
       }
     });
     r += stride;
-    if (r < count) given.read(s, first + r);
+    if (r < count) given.template read<kFree>(s, first + r);
   }
   __syncthreads();
   int64_t* sums = static_cast<int64_t*>(s.sums);

@@ -132,6 +132,10 @@ __device__ void home_bounds(const SolverView<T>& s, int64_t home, int64_t first,
     T velocity[3], slope[9];
     load_motion(s, p, velocity, slope);
     bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);
+    if (s.own != nullptr) {
+      load_nine(s, s.own, p, slope);
+      bound = larger(float(momentum_bound(velocity, slope, m, s.dx)), bound);
+    }
     mass = larger(float(m), mass);
   }
   const float values[2] = {bound, mass};

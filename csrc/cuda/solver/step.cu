@@ -1,138 +1,10 @@
-// One step of the resident solver on the GPU: p2g and the nodes (headers), g2p with the material
-// laws, and what the last warp of a step does.
-#include "cuda/solver/p2g.h"
+// One step of the resident solver on the GPU: p2g, the nodes and g2p (headers).
+#include "cuda/solver/g2p.h"
 
 namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
-constexpr int kG2PThreads = 128;  // as kP2GThreads
-// CTAs of a multiprocessor: more for the laws that need fewer registers.
-constexpr int g2p_ctas(int laws) { return laws == kElasticOnly ? 7 : (with_springs(laws) ? 5 : 6); }
-
-// Brings the line at p near; nothing waits for it.
-__device__ inline void prefetch(const void* p) {
-  asm volatile("prefetch.global.L1 [%0];" ::"l"(p));
-}
-
-// Maxima of a step, for the clock and the home. One warp calls; each lane sees to one of them.
-template <typename T>
-__device__ void hand_over(const SolverView<T>& s, const unsigned (&bits)[4], int64_t home,
-                          bool moving) {
-  const int lane = threadIdx.x & 31;
-  SolverClock& c = *s.clock;
-  if (lane < 3 && moving)
-    raise_to(lane == 0 ? &c.speed : (lane == 1 ? &c.wave : &c.gradient),
-             root_up(lane == 0 ? bits[0] : (lane == 1 ? bits[1] : bits[2])));
-  if (lane == 3 && home >= 0) {
-    const float bound = __uint_as_float(bits[3]) * 1.000002f;
-    raise_real(s.home_bound + home, T(bound));
-    raise_to(&c.bound, __float_as_uint(bound));
-  }
-  __syncwarp();
-}
-
-// What the last warp of a step does: colliders move on, then time. Out of line, so that g2p does
-// not hold its registers.
-template <typename T>
-__device__ __noinline__ void end_of_step(const SolverView<T>& s) {
-  const int lane = threadIdx.x & 31;
-  for (int64_t k = lane; k < s.collider_count; k += 32) {
-    // All loads before the first store, so that they are under way together.
-    int64_t units[kImpulseSums];
-    for (int i = 0; i < kImpulseSums; ++i) units[i] = s.impulse_units[kImpulseSums * k + i];
-    double sums[kImpulseSums];
-    for (int i = 0; i < kImpulseSums; ++i) {
-      sums[i] = double(units[i]) * sum_unit(s, i);
-      if (units[i] != 0) s.impulse_units[kImpulseSums * k + i] = 0;
-    }
-    const double moved = end_collider(s, k, sums, s.clock->dt);
-    if (moved > 0.0) raise_to(&s.clock->moved, sortable(float(moved) * 1.000001f));
-  }
-  __threadfence();
-  __syncwarp();
-  if (lane != 0) return;
-  // On a copy: all loads at once, then all stores.
-  SolverClock clock = *s.clock;
-  clock.travel += float_of_bits(clock.moved);
-  clock.moved = 0;
-  end_step(clock, double(s.dx), s.count);
-  choose_unit(clock);
-  *s.clock = clock;
-}
-
-template <typename T, int kLaws, bool kTrack>
-__global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws))
-    g2p_kernel(const __grid_constant__ SolverView<T> s, int split_shift) {
-  const SolverClock& clock = *s.clock;
-  const int64_t home = blockIdx.x >> split_shift;
-  if (!may_step(clock) || home >= clock.homes) return;
-  const int part = blockIdx.x & ((1 << split_shift) - 1);
-  __shared__ T tile[3][kTile];
-  __shared__ CtaEnd<4> end;
-  end.clear();
-  const HomeList<T>& homes = s.homes();
-  const int64_t first = homes.start[home];
-  const int64_t count = min(int64_t(homes.count[home]), s.count - first);
-  const T dt = T(clock.dt), dt_next = T(clock.dt_next);
-  const int64_t arrivals = clock.homes << split_shift;
-  const bool waves = measures_waves(clock, kLaws);
-  const T slack = T(clock.slack);
-  const int32_t* neighbour = s.neighbour + home * kNeighbours;
-  const uint32_t reach = reach_of_row(neighbour);
-  const int stride = kG2PThreads << split_shift;
-  int64_t r = part * kG2PThreads + threadIdx.x;
-  bool here = first >= 0 && r < count;
-  for (int index = threadIdx.x; index < kWindowNodes; index += kG2PThreads) {
-    int i, j, k;
-    const int at = window_node(index, i, j, k);
-    const int64_t node = slot_node(neighbour, i, j, k);
-    const Vec3<T> v = node < 0 ? Vec3<T>{T(0), T(0), T(0)} : load_velocity(s, node);
-    for (int c = 0; c < 3; ++c) tile[c][at] = v[c];
-  }
-  __syncthreads();
-  Largest largest{};
-  bool leaves = false, lost = false;
-  while (__any_sync(kAllLanes, here)) {
-    StepFlags flags{};
-    if (here) {
-      const ParticleBefore<T> before = particle_before<T, kLaws>(s, first + r);
-      prefetch(s.rows + int64_t(before.row) * kRowColumns);
-      const Stencil<T> st = stencil_at(before.offset);
-      const int base = window_base(before.meta);
-      T value[3] = {};
-      Mat3<T> moment{};
-      const auto node = [&](int c, int i, int j, int k) {
-        return tile[c][base + i * kStrideX + j * kStrideY + k];
-      };
-      // Two fused operations; one rounding more does not show beside those of the sums below it.
-      const auto row = [](T middle, T w0, T low, T w2, T high) {
-        return (middle + w0 * low) + w2 * high;
-      };
-      gather_stencil(st, node, row, value, moment);
-      flags = finish_particle<T, kLaws, kTrack>(s, first + r, before, reach, value, moment, dt,
-                                                dt_next, waves, slack, largest);
-    }
-    if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
-    if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {
-      count_lanes(flags.guarded, &s.clock->guarded);
-      count_lanes(flags.inverted, &s.clock->inverted);
-      count_lanes(flags.invalid, &s.clock->invalid);
-    }
-    leaves = leaves || flags.leaves;
-    lost = lost || flags.lost;
-    r += stride;
-    here = here && r < count;
-  }
-  count_lanes(leaves, &s.clock->leaving);
-  count_lanes(lost, &s.clock->lost);
-  const float values[4] = {largest.speed2, largest.wave2, largest.gradient2, largest.bound};
-  unsigned bits[4];
-  if (!end.leave(values, bits)) return;
-  hand_over(s, bits, home, true);
-  if (last_to_arrive(&s.clock->arrived, arrivals)) end_of_step(s);
-}
-
 template <typename T, int kLaws>
 __global__ void __launch_bounds__(kThreads)
     prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
@@ -166,6 +38,7 @@ __global__ void __launch_bounds__(kThreads)
 template <typename T>
 cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  if (s.radius != nullptr) solver_spring_rows(s, stream);
   for (const bool measure : {true, false})
     if (with_springs(law_set))
       prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
@@ -179,37 +52,27 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
   const int shift = split_shift(s);
   const unsigned ctas = homes << shift;
-  constexpr int kSlotsPerCta = kThreads / kBlockNodes;
-  const unsigned slots = static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta);
+  if (s.own != nullptr) solver_free(s, stream);
+  if (s.radius != nullptr) solver_points(s, stream);
   p2g_kernel<T><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
-  if (s.moments != nullptr) {
+  if (s.moments != nullptr)
     p2g_shared_kernel<T><<<min(ctas, kSharedCtas), kP2GThreads, 0, stream>>>(s, shift);
-    contact_kernel<T>  // a shared site has two slots at least
-        <<<min(static_cast<unsigned>((s.slot_capacity + 1) / 2), kSharedCtas), kBlockNodes, 0,
-           stream>>>(s);
-  }
-  grid_kernel<T><<<slots, kThreads, 0, stream>>>(s);
-  const bool track = s.deformation != nullptr;
-  if (law_set == kElasticOnly && !track)
-    g2p_kernel<T, kElasticOnly, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kElasticOnly)
-    g2p_kernel<T, kElasticOnly, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kBrittle && !track)
-    g2p_kernel<T, kBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kBrittle)
-    g2p_kernel<T, kBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kViscousBrittle && !track)
-    g2p_kernel<T, kViscousBrittle, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kViscousBrittle)
-    g2p_kernel<T, kViscousBrittle, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kViscousAny && !track)
-    g2p_kernel<T, kViscousAny, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (law_set == kViscousAny)
-    g2p_kernel<T, kViscousAny, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
-  else if (!track)
-    g2p_kernel<T, kAnyLaw, false><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+  if (s.radius != nullptr)
+    launch_nodes<T, true>(s, stream);
   else
-    g2p_kernel<T, kAnyLaw, true><<<ctas, kG2PThreads, 0, stream>>>(s, shift);
+    launch_nodes<T, false>(s, stream);
+  if (s.own != nullptr)
+    solver_keep(s, law_set, stream);
+  else if (law_set == kElasticOnly)
+    launch_g2p<T, kElasticOnly, false>(s, stream);
+  else if (law_set == kBrittle)
+    launch_g2p<T, kBrittle, false>(s, stream);
+  else if (law_set == kViscousBrittle)
+    launch_g2p<T, kViscousBrittle, false>(s, stream);
+  else if (law_set == kViscousAny)
+    launch_g2p<T, kViscousAny, false>(s, stream);
+  else
+    launch_g2p<T, kAnyLaw, false>(s, stream);
   return cudaGetLastError();
 }
 

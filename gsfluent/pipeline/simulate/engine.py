@@ -85,7 +85,7 @@ class SolverOptions:
     Args:
         cfl: Courant number of the automatic time step, in (0, 1]. Below 0.5 points keep part of
             their own motion (FLIP), so that shorter steps lose no more in the same time; the
-            resident solver on a CPU only, and not beside phase-field matter.
+            resident solver only, and not beside phase-field matter.
         free_flight: Move bodies that touch nothing in closed form instead of on the grid.
         piece_flight: Do so again with bodies and pieces that touch nothing any more.
         sleep: Take off the grid what rests, until something comes near.
@@ -103,8 +103,8 @@ class SolverOptions:
             something comes near; else its weight begins to act then.
         surface: Let plain separating colliders and other bodies push the points, so that bodies lie
             on floors and on each other and not up to 1.5 cells above them (docs/theory/colliders.md
-            and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver on
-            a CPU only; the composed operators hold nodes.
+            and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver
+            only; the composed operators hold nodes.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         max_rollbacks: Roll-backs in a row before the run is given up.

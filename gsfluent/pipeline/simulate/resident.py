@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.errors import InputError
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
@@ -90,16 +89,8 @@ def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
 
     The outermost points of a jittered lattice lie a quarter of its spacing inside of the face. Of a
     point that starts nearer the radius is that distance: nothing is thrown out of what it overlaps.
-
-    Raises:
-        InputError: Points on a device whose solver cannot push them.
     """
     particles = matter.particles
-    if particles.device.type != "cpu":
-        raise InputError(
-            f"simulate: surface=True is not there on {particles.device.type} yet",
-            hint="leave it out, or simulate on the CPU",
-        )
     usual = (ROUGH * particles.volume.double() ** (1.0 / 3.0)).clamp(max=0.5 * matter.dx)
     usual = torch.minimum(usual, apart(matter))
     if not rigid.start.shape[0]:
@@ -115,8 +106,8 @@ def apart(matter: Matter) -> Tensor:
     """
     from scipy.spatial import cKDTree
 
-    place = matter.rest.double().numpy() / matter.dx
-    volume = matter.particles.volume.double().numpy() / matter.dx**3
+    place = matter.rest.double().cpu().numpy() / matter.dx
+    volume = matter.particles.volume.double().cpu().numpy() / matter.dx**3
     found = np.zeros(len(place))
 
     def near(own: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
@@ -140,7 +131,8 @@ def apart(matter: Matter) -> Tensor:
     distance = np.linspace(0.9, -1.9, 28001)  # the share grows along these
     share = touch.share(torch.from_numpy(distance)).numpy()
     # a little less: rounding pushes nobody
-    return torch.from_numpy(matter.dx * (np.interp(found, share, distance) - 1e-5))
+    apart = torch.from_numpy(matter.dx * (np.interp(found, share, distance) - 1e-5))
+    return apart.to(matter.particles.volume.device)
 
 
 class Resident:
@@ -191,14 +183,14 @@ class Resident:
             material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
             cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
         )  # fmt: skip
-        if p.velocity.device.type == "cpu" and not matter.has_field:
+        if not matter.has_field:
             constants["flip"] = options.flip
         if options.surface:
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(
                 torch.tensor([end - start for start, end in matter.ranges])
             )
-            self._object = at_rows(which, rows)
+            self._object = at_rows(which.to(p.device), rows)
         self._constants: dict[str, Any] = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -52,9 +53,9 @@ def smashed() -> Scene:
 
 
 def run(
-    scene: Scene, device: str, fps: float, seconds: float
+    scene: Scene, device: str, fps: float, seconds: float, **options: Any
 ) -> tuple[list[SimulationFrame], dict]:  # type: ignore[type-arg]
-    simulation = Simulate(dx=0.02, device=device)(scene, fps=fps, seconds=seconds)
+    simulation = Simulate(dx=0.02, device=device, **options)(scene, fps=fps, seconds=seconds)
     frames = list(simulation)
     report = simulation.report
     assert report["verdict"] == "clean", report["reason"]
@@ -91,6 +92,26 @@ def test_a_run_on_the_gpu_equals_one_on_the_cpu(
         assert abs(a.stats["fragments"] - b.stats["fragments"]) <= (1 if make is smashed else 0)
     kept = saved(there[-1], scene)
     assert bool(torch.isfinite(kept.gaussians.means).all())
+
+
+def stacked() -> Scene:
+    """A ball that lands on another, which lies on the floor."""
+    scene = Scene()
+    for height in (0.05, 0.16):
+        scene.add(ellipsoid((0.05,) * 3), SOFT, frame=at(0.0, 0.0, height))
+    return scene
+
+
+# Off the nodes nothing waits for a node to be reached: what falls is where it is on a CPU.
+@pytest.mark.parametrize("options", [{"surface": True}, {"surface": True, "cfl": 0.25}])
+def test_points_are_pushed_and_keep_their_motion_as_on_the_cpu(options: dict[str, Any]) -> None:
+    (here, _), (there, _) = (
+        run(stacked(), device, 50, 0.1, sleep=False, **options) for device in ("cpu", "cuda")
+    )
+    assert len(here) == len(there)
+    for a, b in zip(here, there, strict=True):
+        apart = (a.particles.position - b.particles.position.cpu()).norm(dim=1).mean()
+        assert float(apart) < 0.05 * 0.02, a.index
 
 
 def test_a_state_goes_from_one_device_to_the_other(tmp_path: Path) -> None:

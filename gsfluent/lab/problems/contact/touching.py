@@ -96,7 +96,7 @@ def slide(friction: float, angle: float = 45.0) -> Result:
     before = world.momentum(block)
     world.run(60.0)
     mass = float(world.scene.mass[block].double().sum())
-    given = (world.momentum(block) - before) / mass - 60.0 * torch.tensor(pull).double()
+    given = (world.momentum(block) - before) / mass - 60.0 * torch.tensor(pull).to(before)
     return compare(
         "force along over force across", -float(given[0] / given[2]), friction,
         error=-float(given[0] / given[2]) / friction - 1.0, tolerance=0.03, source="Coulomb",

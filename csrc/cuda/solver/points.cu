@@ -1,0 +1,446 @@
+// Points of the resident solver that colliders push, and points of different objects that push each
+// other (core/solver/points.h): what they get in a step goes to the nodes about them as sums of
+// whole numbers, apart from the other sums, and the kernels of the nodes take it in. No order of
+// points or threads changes a bit. On the CPU: cpu/solver/surface.h, cpu/contact/points.h.
+//
+// Points that could touch another object are listed by cell in every step. The first of a cell
+// stands, plus one, in the fourth word of the node velocity at the cell's lower corner: nothing
+// else is there, and the kernels of the nodes put a 0 behind every velocity. What points are given
+// and have found lies in `spare`, which nobody needs between two builds.
+#include "cuda/solver/p2g.h"
+
+namespace gsf::cuda {
+namespace {
+
+constexpr int kThreads = 128;
+// Units of the sums over the points near one: of a share, and of a stiffness and a force over the
+// largest; of a rate times the longest step. Room for 8192 and 2^19 of them.
+constexpr double kShareUnit = 0x1p-50, kRateUnit = 0x1p-44;
+
+template <typename T>
+__device__ double longest_step(const SolverView<T>& s) {
+  return spring_step(*s.clock, s.spring_rows[2 * s.row_count], double(s.dx));
+}
+
+// The fastest wave of all rows, then what others see of a point of each row.
+template <typename T>
+__global__ void __launch_bounds__(kThreads)
+    rows_kernel(const __grid_constant__ SolverView<T> s, bool waves) {
+  const int64_t row = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (row >= s.row_count) return;
+  double* largest = s.spring_rows + 2 * s.row_count;
+  if (waves) {
+    raise_real(largest, row_wave(s, row));
+    return;
+  }
+  const TouchMatter matter = touch_matter(s, row, longest_step(s));
+  s.spring_rows[2 * row] = matter.volume;
+  s.spring_rows[2 * row + 1] = matter.stiffness;
+  raise_real(largest + 1, matter.stiffness);
+}
+
+// What `spare` holds between two builds, 32 of its 36 bytes per point (float).
+template <typename T>
+struct Room {
+  Quad<T>* given;   // [N] impulse and how much it may rub [N s]
+  double* energy;   // [N] of those that may touch another object
+  int32_t* next;    // [N] of the list of their cell, or -1
+  int32_t* filled;  // [homes] whether points of a home are given anything
+
+  __device__ explicit Room(const SolverView<T>& s)
+      : given(reinterpret_cast<Quad<T>*>(s.spare)),
+        energy(reinterpret_cast<double*>(given + s.count)),
+        next(reinterpret_cast<int32_t*>(energy + s.count)),
+        filled(next + s.count) {}
+};
+// The first point of a cell, plus one.
+template <typename T>
+__device__ int32_t* cell_head(const SolverView<T>& s, int64_t node) {
+  return reinterpret_cast<int32_t*>(s.node_velocity + 4 * node + 3);
+}
+
+// Range of the points of a home, and the slots under its window.
+template <typename T>
+struct HomeRange {
+  int64_t first, count;
+
+  __device__ HomeRange(const SolverView<T>& s, int64_t home) {
+    first = s.homes().start[home];
+    count = first >= 0 ? min(int64_t(s.homes().count[home]), s.count - first) : 0;
+  }
+};
+template <typename T>
+__device__ void load_slots(const SolverView<T>& s, int64_t home, int32_t* neighbour) {
+  if (threadIdx.x >= kNeighbours) return;
+  const int32_t slot = s.neighbour[home * kNeighbours + threadIdx.x];
+  neighbour[threadIdx.x] = slot < s.slot_capacity ? slot : -1;
+}
+
+// Keeps what a point is given; the largest number of it.
+template <typename T>
+__device__ float keep_given(const Room<T>& room, int64_t p, const T* given) {
+  room.given[p] = {given[0], given[1], given[2], given[3]};
+  float most = 0.0f;
+  for (int c = 0; c < 4; ++c) most = larger(float(fabs(given[c])), most);
+  return most;
+}
+// Ends a home, whole CTAs together: whether its points are given anything, and the largest number.
+template <typename T>
+__device__ void note_given(const SolverView<T>& s, int which, int64_t home, float most) {
+  const int any = __syncthreads_or(!(most == 0.0f));
+  if (threadIdx.x == 0) Room<T>(s).filled[home] = any;
+  if (any == 0) return;
+  const unsigned bits = __reduce_max_sync(kAllLanes, sortable(most * 1.000001f));
+  if ((threadIdx.x & 31) == 0) raise_to(given_bound(s, which), bits);
+}
+
+// Adds what the points of a home are given to the nodes of its window.
+struct GivenWindow {
+  unsigned long long sums[4][kTile];
+  int32_t neighbour[kNeighbours];
+};
+template <typename T>
+__device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, GivenWindow& window) {
+  const Room<T> room(s);
+  if (room.filled[home] == 0) return;
+  for (int i = threadIdx.x; i < 4 * kTile; i += kThreads) (&window.sums[0][0])[i] = 0;
+  load_slots(s, home, window.neighbour);
+  __syncthreads();
+  const HomeRange<T> range(s, home);
+  const double per_unit = 1.0 / given_unit(s, which);
+  for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
+    const Quad<T> q = room.given[range.first + r];
+    const double given[4] = {double(q.x), double(q.y), double(q.z), double(q.w)};
+    if (given[0] == 0.0 && given[1] == 0.0 && given[2] == 0.0) continue;
+    T offset[3];
+    const int base = window_base(load_place(s, range.first + r, offset));
+    const Stencil<T> st = stencil_at(offset);
+    for_each_node([&](int i, int j, int k) {
+      const double w = double(st.weight(i, j, k)) * per_unit;
+      for (int c = 0; c < 4; ++c)
+        atomicAdd(&window.sums[c][base + i * kStrideX + j * kStrideY + k],
+                  static_cast<unsigned long long>(__double2ll_rn(w * given[c])));
+    });
+  }
+  __syncthreads();
+  int64_t* out = which == kPush ? s.push : s.press;
+  for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
+    int i, j, k;
+    const int at = window_node(index, i, j, k);
+    const int64_t node = slot_node(window.neighbour, i, j, k);
+    for (int c = 0; c < 4 && node >= 0; ++c)
+      if (window.sums[c][at] != 0)
+        add_units(out + 4 * node + c, static_cast<long long>(window.sums[c][at]));
+  }
+}
+
+// Radius of a point [m].
+template <typename T>
+__device__ double radius_of(const SolverView<T>& s, int64_t p) {
+  const int32_t id = s.id[p];
+  return id >= 0 && id < s.count ? double(s.radius[id]) : 0.0;
+}
+
+// Friction beyond this holds all the same; the unit of the sums is for less.
+constexpr double kFrictionMost = 1e6;
+
+// What colliders give.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  const int64_t home = blockIdx.x;
+  if (!may_step(clock) || home >= min(clock.homes, s.count)) return;
+  __shared__ unsigned long long near;  // as slot_near: bit 63 stands for all the others
+  if (threadIdx.x == 0) near = 0;
+  __syncthreads();
+  const int32_t* block = s.homes().coord + 4 * home;
+  const Vec3<double> middle = home_middle(s, block);
+  for (int64_t k = threadIdx.x; k < s.collider_count; k += kThreads)
+    if (pushes_points(s, k) &&
+        collider_clearance(s.collider_state + k * kColliderColumns, s.sdf, middle) <= home_reach(s))
+      atomicOr(&near, 1ull << min(k, int64_t(63)));
+  __syncthreads();
+  const HomeRange<T> range(s, home);
+  const Room<T> room(s);
+  const double dx = double(s.dx), longest = longest_step(s);
+  float most = 0.0f;
+  for (int64_t r = threadIdx.x; near != 0 && r < range.count; r += kThreads) {
+    const int64_t p = range.first + r;
+    T offset[3], given[4] = {T(0), T(0), T(0), T(0)};
+    const uint32_t meta = load_place(s, p, offset);
+    PushedPoint<T> point;
+    for (int axis = 0; axis < 3; ++axis)
+      point.x[axis] = (4.0 * block[axis] - 0.5 + meta_cell(meta, axis) + double(offset[axis])) * dx;
+    load_speed(s, p, point.velocity);
+    point.radius = radius_of(s, p);
+    point.row = s.row_of(meta);
+    for (unsigned long long left = near; left != 0; left &= left - 1) {
+      const int64_t first = __ffsll(static_cast<long long>(left)) - 1;
+      const int64_t end = first == 63 ? s.collider_count : first + 1;
+      for (int64_t k = first; k < end; ++k)
+        if (pushes_points(s, k)) push_point(s, k, point, longest, given);
+    }
+    const Vec3<T> j{given[0], given[1], given[2]};
+    given[3] = T(fmin(double(given[3]), kFrictionMost * double(norm(j))));
+    most = larger(keep_given(room, p, given), most);
+  }
+  note_given(s, kPush, home, most);
+}
+template <typename T>
+__global__ void __launch_bounds__(kThreads)
+    push_scatter_kernel(const __grid_constant__ SolverView<T> s) {
+  __shared__ GivenWindow window;
+  if (may_step(*s.clock) && int64_t(blockIdx.x) < min(s.clock->homes, s.count))
+    scatter_home(s, kPush, blockIdx.x, window);
+}
+
+// Which points of a home could touch another object: those with nodes in blocks that fields share.
+template <typename T>
+__device__ void load_shared(const SolverView<T>& s, const int32_t* neighbour, bool* shared) {
+  if (threadIdx.x < kNeighbours) {
+    const int32_t slot = neighbour[threadIdx.x];
+    shared[threadIdx.x] = slot >= 0 && s.slot_shared[slot] == 1;
+  }
+}
+__device__ bool may_touch(const bool* shared, uint32_t meta) {
+  int low[3], high[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    const int l = min(meta_cell(meta, axis), kLastCell);
+    low[axis] = window_block(l);
+    high[axis] = window_block(l + 2);
+  }
+  bool any = false;
+  for (int i = low[0]; i <= high[0]; ++i)
+    for (int j = low[1]; j <= high[1]; ++j)
+      for (int k = low[2]; k <= high[2]; ++k) any = any || shared[(i * 3 + j) * 3 + k];
+  return any;
+}
+
+// Calls f(home) for the homes whose windows touch shared blocks, whole CTAs together. bound_kernel
+// has listed them in `entry`.
+template <typename T, typename F>
+__device__ void for_shared_homes(const SolverView<T>& s, const F& f) {
+  const SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  for (int64_t i = blockIdx.x; i < min(clock.shared_homes, s.count); i += gridDim.x) {
+    const int64_t home = s.entry[i];
+    if (home >= 0 && home < min(min(clock.homes, s.count), s.home_capacity)) f(home);
+    __syncthreads();  // what lies in shared memory is used again
+  }
+}
+
+template <typename T>
+__global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ SolverView<T> s) {
+  __shared__ int32_t neighbour[kNeighbours];
+  __shared__ bool shared[kNeighbours];
+  for_shared_homes(s, [&](int64_t home) {
+    load_slots(s, home, neighbour);
+    __syncthreads();
+    load_shared(s, neighbour, shared);
+    __syncthreads();
+    const HomeRange<T> range(s, home);
+    const Room<T> room(s);
+    for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
+      const int64_t p = range.first + r;
+      const uint32_t meta = load_meta(s, p);
+      if (!may_touch(shared, meta)) continue;
+      const int64_t node =
+          slot_node(neighbour, min(meta_cell(meta, 0), kLastCell),
+                    min(meta_cell(meta, 1), kLastCell), min(meta_cell(meta, 2), kLastCell));
+      if (node >= 0) room.next[p] = atomicExch(cell_head(s, node), static_cast<int32_t>(p + 1)) - 1;
+    }
+  });
+}
+
+// A point that looks for those of other objects.
+template <typename T>
+struct Seeker {
+  T offset[3], velocity[3];
+  uint32_t meta;
+  int32_t field;
+};
+
+// Calls f(q, d, r2) for the points of other objects near one. `heads`: first slot of the site of
+// each of the 27 blocks around the home. The order is any.
+template <typename T, typename F>
+__device__ void for_others(const SolverView<T>& s, const int32_t* heads, const Seeker<T>& p,
+                           const F& f) {
+  const int32_t* next = Room<T>(s).next;
+  for (int o = 0; o < kNeighbours; ++o) {
+    int at[3];  // in the window, from -1 to 6: the blocks around the home hold -3 to 8
+    for (int axis = 0; axis < 3; ++axis)
+      at[axis] = min(meta_cell(p.meta, axis), kLastCell) + neighbour_step(o, axis);
+    int32_t slot = heads[neighbour_of(at[0], at[1], at[2])];
+    const int there = local_index(window_local(at[0]), window_local(at[1]), window_local(at[2]));
+    for (int field = 0; field < kSiteFields && slot >= 0 && slot < s.slot_capacity;
+         ++field, slot = s.slot_next[slot]) {
+      if (!s.touches_by_points(p.field, s.slot_coord[4 * int64_t(slot) + 3])) continue;
+      int64_t q = int64_t(*cell_head(s, int64_t(slot) * kBlockNodes + there)) - 1;
+      for (int64_t tries = 0; q >= 0 && q < s.count && tries < s.count; ++tries, q = next[q]) {
+        T offset[3];
+        load_place(s, q, offset);
+        double d[3], r2 = 0.0;
+        for (int axis = 0; axis < 3; ++axis) {
+          d[axis] = double(p.offset[axis]) - double(offset[axis]) - neighbour_step(o, axis);
+          r2 += d[axis] * d[axis];
+        }
+        if (r2 < kTouchReach * kTouchReach) f(q, d, r2);
+      }
+    }
+  }
+}
+
+template <typename T>
+__device__ TouchMatter matter_of(const SolverView<T>& s, uint32_t meta) {
+  const double* row = s.spring_rows + 2 * int64_t(s.row_of(meta));
+  return {row[0], row[1]};
+}
+// A power of two above the largest stiffness [Pa].
+template <typename T>
+__device__ double stiffness_above(const SolverView<T>& s) {
+  return power_above(fmax(s.spring_rows[2 * s.row_count + 1], 1e-30));
+}
+__device__ inline long long units_of(double value, double per_unit) {
+  return __double2ll_rn(value * per_unit);
+}
+
+// What a home's kernels need of the blocks around it.
+struct Around {
+  int32_t neighbour[kNeighbours], heads[kNeighbours];
+  bool shared[kNeighbours];
+
+  // Whole CTAs together.
+  template <typename T>
+  __device__ void load(const SolverView<T>& s, int64_t home) {
+    load_slots(s, home, neighbour);
+    __syncthreads();
+    load_shared(s, neighbour, shared);
+    if (threadIdx.x < kNeighbours) {
+      const int32_t* c = s.homes().coord + 4 * home;
+      const int n = threadIdx.x;
+      const int32_t e = find(
+          s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, kMaxSolverFields));
+      heads[n] = e >= 0 ? s.table_slot[e] : -1;
+    }
+    __syncthreads();
+  }
+};
+
+// How much of other objects the points find, and the energy that follows.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ SolverView<T> s) {
+  __shared__ Around around;
+  for_shared_homes(s, [&](int64_t home) {
+    around.load(s, home);
+    const HomeRange<T> range(s, home);
+    const int32_t field = s.homes().coord[4 * home + 3];
+    const double dx = double(s.dx);
+    const double stiffness_unit = kShareUnit * stiffness_above(s);
+    const double rate_unit = kRateUnit / power_above(fmax(longest_step(s), 1e-30));
+    for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
+      const int64_t p = range.first + r;
+      Seeker<T> seeker;
+      seeker.meta = load_place(s, p, seeker.offset);
+      if (!may_touch(around.shared, seeker.meta)) continue;
+      load_speed(s, p, seeker.velocity);
+      seeker.field = field;
+      double velocity[3];
+      for (int axis = 0; axis < 3; ++axis) velocity[axis] = double(seeker.velocity[axis]) / dx;
+      long long share = 0, stiffness = 0, rate = 0;
+      for_others(s, around.heads, seeker, [&](int64_t q, const double* d, double r2) {
+        T speed[3];
+        load_speed(s, q, speed);
+        double velocity_q[3];
+        for (int axis = 0; axis < 3; ++axis) velocity_q[axis] = double(speed[axis]) / dx;
+        TouchFound found{0.0, 0.0, 0.0};
+        add_found(matter_of(s, load_meta(s, q)), d, r2, velocity, velocity_q, found);
+        share += units_of(found.share, 1.0 / kShareUnit);
+        stiffness += units_of(found.stiffness, 1.0 / stiffness_unit);
+        rate += units_of(found.rate, 1.0 / rate_unit);
+      });
+      const TouchFound sum{double(share) * kShareUnit, double(stiffness) * stiffness_unit,
+                           double(rate) * rate_unit};
+      Room<T>(s).energy[p] =
+          touch_energy(matter_of(s, seeker.meta), touch_share(radius_of(s, p) / dx),
+                       spring_lag(row_wave(s, s.row_of(seeker.meta)), dx), sum);
+    }
+  });
+}
+
+// What they get.
+template <typename T>
+__global__ void __launch_bounds__(kThreads) press_kernel(const __grid_constant__ SolverView<T> s) {
+  __shared__ Around around;
+  for_shared_homes(s, [&](int64_t home) {
+    around.load(s, home);
+    const HomeRange<T> range(s, home);
+    const Room<T> room(s);
+    const int32_t field = s.homes().coord[4 * home + 3];
+    const double unit = kShareUnit * stiffness_above(s);
+    float most = 0.0f;
+    for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
+      const int64_t p = range.first + r;
+      Seeker<T> seeker;
+      seeker.meta = load_place(s, p, seeker.offset);
+      seeker.field = field;
+      long long units[3] = {0, 0, 0};
+      if (may_touch(around.shared, seeker.meta)) {
+        const double energy = room.energy[p], volume = matter_of(s, seeker.meta).volume;
+        for_others(s, around.heads, seeker, [&](int64_t q, const double* d, double r2) {
+          const double energy_q = room.energy[q];
+          if (energy == 0.0 && energy_q == 0.0) return;
+          const double force =
+              touch_force(energy, volume, energy_q, matter_of(s, load_meta(s, q)).volume, r2);
+          for (int axis = 0; axis < 3; ++axis) units[axis] += units_of(force * d[axis], 1.0 / unit);
+        });
+      }
+      double sum[3];
+      T given[4];
+      for (int axis = 0; axis < 3; ++axis) sum[axis] = double(units[axis]) * unit;
+      touch_given(sum, s.clock->dt, double(s.dx), given);
+      most = larger(keep_given(room, p, given), most);
+    }
+    note_given(s, kPress, home, most);
+  });
+}
+template <typename T>
+__global__ void __launch_bounds__(kThreads)
+    press_scatter_kernel(const __grid_constant__ SolverView<T> s) {
+  __shared__ GivenWindow window;
+  for_shared_homes(s, [&](int64_t home) { scatter_home(s, kPress, home, window); });
+}
+
+}  // namespace
+
+template <typename T>
+void solver_spring_rows(const SolverView<T>& s, cudaStream_t stream) {
+  if (s.row_count == 0) return;
+  const unsigned ctas = static_cast<unsigned>((s.row_count + kThreads - 1) / kThreads);
+  cudaMemsetAsync(s.spring_rows + 2 * s.row_count, 0, 2 * sizeof(double), stream);
+  for (const bool waves : {true, false}) rows_kernel<T><<<ctas, kThreads, 0, stream>>>(s, waves);
+}
+
+template <typename T>
+void solver_points(const SolverView<T>& s, cudaStream_t stream) {
+  const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  cudaMemsetAsync(s.spring_rows + 2 * (s.row_count + 1), 0, 2 * sizeof(uint64_t), stream);
+  if (s.collider_count > 0) {
+    push_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    push_scatter_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+  }
+  if (s.object == nullptr || s.moments == nullptr) return;
+  const unsigned shared = min(homes, kSharedCtas);
+  list_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  find_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  press_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  press_scatter_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+}
+
+#define GSF_INSTANTIATE(T)                                                 \
+  template void solver_spring_rows<T>(const SolverView<T>&, cudaStream_t); \
+  template void solver_points<T>(const SolverView<T>&, cudaStream_t);
+GSF_INSTANTIATE(float)
+GSF_INSTANTIATE(double)
+#undef GSF_INSTANTIATE
+
+}  // namespace gsf::cuda
