@@ -77,7 +77,8 @@ enum SolverFloat : int {
   kFlip,
   kSolverFloats
 };
-enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kSolverInts };
+constexpr int64_t kMostRanks = 64;
+enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kRanks, kSolverInts };
 
 template <class Backend>
 struct SolverOps {
@@ -178,6 +179,9 @@ struct SolverOps {
     const auto any_at = [&](int i) -> void* {
       return b[i].numel() ? b[i].mutable_data_ptr() : nullptr;
     };
+    s.ranks = static_cast<int32_t>(ints[kRanks]);
+    STD_TORCH_CHECK(ints[kRanks] >= 1 && ints[kRanks] <= (device ? 1 : kMostRanks),
+                    "solver: ranks must be 1 to ", kMostRanks, ", and 1 on a GPU");
     s.fields = static_cast<int32_t>(ints[kFields]);
     STD_TORCH_CHECK(s.fields >= 1 && s.fields < kMaxSolverFields, "solver: fields must be 1 to ",
                     kMaxSolverFields - 1);

@@ -58,15 +58,21 @@ class HomePass {
   // Adds every particle to the sums of its nodes and marks the slots. Particles of homes with nodes
   // that have no slot count as lost.
   Counts to_nodes(std::vector<uint8_t>& touched) {
+    begin();
     Counts all;
-    touch_.run();
-    for (const std::vector<int32_t>& homes : colors_)
-      all.add(parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,
-                              [&](int64_t begin, int64_t end, Counts& counts) {
-                                for (int64_t i = begin; i < end; ++i)
-                                  if (!home_to_nodes(homes[i], touched)) ++counts.lost;
-                              }));
+    for (int color = 0; color < kColors; ++color) all.add(to_nodes(color, touched));
     return all;
+  }
+  // The same in parts: what comes first, then the homes of each colour. A node gets at most one
+  // addend from each, so ranks that share nodes can agree in between.
+  void begin() { touch_.run(); }
+  Counts to_nodes(int color, std::vector<uint8_t>& touched) {
+    const std::vector<int32_t>& homes = colors_[color];
+    return parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,
+                           [&](int64_t begin, int64_t end, Counts& counts) {
+                             for (int64_t i = begin; i < end; ++i)
+                               if (!home_to_nodes(homes[i], touched)) ++counts.lost;
+                           });
   }
 
   // Updates every particle from the velocities of its nodes.

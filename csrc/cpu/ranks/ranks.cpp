@@ -1,0 +1,256 @@
+// See cpu/ranks/ranks.h. A file of its own, so that the loops of one rank stay as they are
+// compiled.
+#include "cpu/ranks/ranks.h"
+
+#include <bit>
+
+namespace gsf::cpu {
+namespace {
+
+constexpr int64_t kHaloGrain = 16;
+constexpr int kGhostBlocks = 2;  // beyond its own blocks: what they reach, and one more for contact
+enum Held : uint8_t { kHeld = 1, kNeeded = 2 };
+
+// Row `first` of an array with so many columns that may be absent.
+template <typename W>
+W* row_at(W* array, int64_t first, int columns = 1) {
+  return array != nullptr ? array + first * columns : nullptr;
+}
+
+// Brings the copies of some values to the bits that one of them has changed to. `agreed` are those
+// of all before; at most one copy of each value differs from them, so the order does not matter.
+template <typename Word, typename Value, typename Copy>
+void agree_on(Word* agreed, int64_t values, int64_t copies, const Copy& copy) {
+  static_assert(sizeof(Word) == sizeof(Value));
+  for (int64_t i = 0; i < values; ++i) {
+    Word changed = 0;
+    for (int64_t r = 0; r < copies; ++r) changed ^= std::bit_cast<Word>(copy(r)[i]) ^ agreed[i];
+    if (changed == 0) continue;
+    agreed[i] ^= changed;
+    for (int64_t r = 0; r < copies; ++r) copy(r)[i] = std::bit_cast<Value>(agreed[i]);
+  }
+}
+
+}  // namespace
+
+template <typename T>
+RankCut<T>::RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
+  if (!several()) ranks_[0].view = s;
+}
+
+template <typename T>
+void RankCut<T>::make() {
+  const SolverClock& c = *s_.clock;
+  if (!several()) {
+    ranks_[0].touched.assign(c.slots, 0);
+    return;
+  }
+  site_key_.resize(c.sites);
+  site_of_slot_.assign(c.slots, -1);
+  for (int64_t i = 0; i < c.sites; ++i) {
+    const int32_t* slots = s_.site_slots + kSiteFields * i;
+    const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
+    site_key_[i] = block_key(b[0], b[1], b[2], 0);
+    for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
+      site_of_slot_[slots[f]] = static_cast<int32_t>(i);
+  }
+  answered_.assign(c.sites, 0);
+  share_homes();
+  for (Rank<T>& rank : ranks_) {
+    find_needed(rank);
+    fill(rank);
+  }
+  find_halos();
+}
+
+// Stretches of homes with about as many points each.
+template <typename T>
+void RankCut<T>::share_homes() {
+  const HomeList<T>& list = s_.homes();
+  const int64_t homes = s_.clock->homes, ranks = static_cast<int64_t>(ranks_.size());
+  const auto first_of = [&](int64_t r) {
+    return std::lower_bound(list.start, list.start + homes, r * s_.count / ranks) - list.start;
+  };
+  for (int64_t r = 0; r < ranks; ++r) {
+    ranks_[r].first_home = r == 0 ? 0 : first_of(r);
+    ranks_[r].homes = (r + 1 == ranks ? homes : first_of(r + 1)) - ranks_[r].first_home;
+  }
+}
+
+// Slots under the windows of a rank's homes. Where several fields may meet it also holds every slot
+// of any field within two blocks, whoever needs it: which nodes fields share must not hang on the
+// cut, and contact looks at the nodes around.
+template <typename T>
+void RankCut<T>::find_needed(const Rank<T>& rank) {
+  held_.assign(s_.clock->slots, 0);
+  const int32_t* last = nullptr;
+  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h) {
+    for (int n = 0; n < kNeighbours; ++n) {
+      const int32_t slot = s_.neighbour[kNeighbours * h + n];
+      if (slot >= 0) held_[slot] |= kNeeded | kHeld;
+    }
+    const int32_t* b = s_.homes().coord + 4 * h;
+    if (s_.fields == 1 || (last != nullptr && std::equal(b, b + 3, last))) continue;
+    last = b;
+    for (int i = -kGhostBlocks; i <= kGhostBlocks; ++i)
+      for (int j = -kGhostBlocks; j <= kGhostBlocks; ++j) {
+        const auto key = [&](int k) { return block_key(b[0] + i, b[1] + j, b[2] + k, 0); };
+        auto at = std::lower_bound(site_key_.begin(), site_key_.end(), key(-kGhostBlocks));
+        for (; at != site_key_.end() && *at <= key(kGhostBlocks); ++at) {
+          const int32_t* slots = s_.site_slots + kSiteFields * (at - site_key_.begin());
+          for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) held_[slots[f]] |= kHeld;
+        }
+      }
+  }
+}
+
+// The rank's own lists of what find_needed found, and its view.
+template <typename T>
+void RankCut<T>::fill(Rank<T>& rank) {
+  const HomeList<T>& list = s_.homes();
+  const int64_t home = rank.first_home, end = home + rank.homes;
+  const int64_t first = home < s_.clock->homes ? list.start[home] : s_.count;
+  const int64_t last = end < s_.clock->homes ? list.start[end] : s_.count;
+
+  std::vector<int32_t> number(s_.clock->slots, -1);
+  rank.slots.clear();
+  rank.slot_coord.clear();
+  rank.slot_shared.clear();
+  for (int64_t slot = 0; slot < s_.clock->slots; ++slot) {
+    if (held_[slot] == 0) continue;
+    number[slot] = static_cast<int32_t>(rank.slots.size());
+    rank.slots.push_back(slot);
+    rank.slot_coord.insert(rank.slot_coord.end(), s_.slot_coord + 4 * slot,
+                           s_.slot_coord + 4 * slot + 4);
+    rank.slot_shared.push_back(s_.slot_shared[slot]);
+  }
+  rank.sites = {};
+  rank.site_slots.clear();
+  for (int64_t i = 0; i < s_.clock->sites; ++i) {
+    const int32_t* slots = s_.site_slots + kSiteFields * i;
+    bool needed = false;
+    for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
+      needed = needed || (held_[slots[f]] & kNeeded) != 0;
+    if (!needed) continue;
+    rank.sites.number.push_back(i);
+    rank.sites.answers.push_back(answered_[i] == 0 ? 1 : 0);
+    answered_[i] = 1;
+    for (int f = 0; f < kSiteFields; ++f)
+      rank.site_slots.push_back(slots[f] >= 0 ? number[slots[f]] : -1);
+  }
+  rank.home_start.resize(rank.homes);
+  rank.neighbour.resize(kNeighbours * rank.homes);
+  for (int64_t h = 0; h < rank.homes; ++h)
+    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - first);
+  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i) {
+    const int32_t slot = s_.neighbour[kNeighbours * home + i];
+    rank.neighbour[i] = slot >= 0 ? number[slot] : -1;
+  }
+  const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
+  rank.touched.assign(rank.slots.size(), 0);
+  rank.sums.assign(4 * nodes, 0.0);
+  rank.moments.assign(s_.moments != nullptr ? kContactMoments * nodes : 0, T(0));
+  rank.node_velocity.assign(4 * nodes, T(0));
+
+  SolverView<T>& v = rank.view;
+  v = s_;
+  v.count = last - first;
+  v.home_capacity = rank.homes;
+  v.slot_capacity = static_cast<int64_t>(rank.slots.size());
+  v.clock = &rank.clock;
+  v.offset = row_at(s_.offset, first, 3);
+  v.meta = row_at(s_.meta, first);
+  v.velocity = row_at(s_.velocity, first, 3);
+  v.slope = row_at(s_.slope, first, 9);
+  v.strain = row_at(s_.strain, first, 6);
+  v.alpha = row_at(s_.alpha, first);
+  v.peak = row_at(s_.peak, first);
+  v.deformation = row_at(s_.deformation, first, 9);
+  v.viscous = row_at(s_.viscous, first, kViscousColumns);
+  v.id = row_at(s_.id, first);
+  v.entry = row_at(s_.entry, first);
+  v.home[0] = v.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
+  v.neighbour = rank.neighbour.data();
+  v.slot_coord = rank.slot_coord.data();
+  v.slot_shared = rank.slot_shared.data();
+  v.site_slots = rank.site_slots.data();
+  v.sums = rank.sums.data();
+  v.moments = rank.moments.empty() ? nullptr : rank.moments.data();
+  v.node_velocity = rank.node_velocity.data();
+  rank.tell(*s_.clock);
+}
+
+template <typename T>
+void RankCut<T>::find_halos() {
+  std::vector<std::vector<Holder>> holders(s_.clock->slots);
+  for (size_t r = 0; r < ranks_.size(); ++r)
+    for (size_t i = 0; i < ranks_[r].slots.size(); ++i)
+      holders[ranks_[r].slots[i]].push_back({static_cast<int32_t>(r), static_cast<int32_t>(i)});
+  halos_.clear();
+  holders_.clear();
+  for (const std::vector<Holder>& of_slot : holders) {
+    if (of_slot.size() < 2) continue;
+    halos_.push_back({static_cast<int64_t>(holders_.size()), static_cast<int64_t>(of_slot.size())});
+    holders_.insert(holders_.end(), of_slot.begin(), of_slot.end());
+  }
+  agreed_sums_.assign(halos_.size() * kBlockNodes * 4, 0);
+  agreed_moments_.assign(s_.moments != nullptr ? halos_.size() * kBlockNodes * kContactMoments : 0,
+                         0);
+}
+
+template <typename T>
+void RankCut<T>::begin() {
+  if (!several()) return;
+  for (Rank<T>& rank : ranks_) rank.tell(*s_.clock);
+  std::fill(agreed_sums_.begin(), agreed_sums_.end(), 0);
+  std::fill(agreed_moments_.begin(), agreed_moments_.end(), 0);
+}
+
+template <typename T>
+void RankCut<T>::agree() {
+  parallel_for(static_cast<int64_t>(halos_.size()), kHaloGrain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      const Halo& halo = halos_[i];
+      const Holder* holder = holders_.data() + halo.first;
+      uint8_t marks = 0;
+      for (int64_t r = 0; r < halo.count; ++r)
+        marks |= ranks_[holder[r].rank].touched[holder[r].slot];
+      for (int64_t r = 0; r < halo.count; ++r)
+        ranks_[holder[r].rank].touched[holder[r].slot] = marks;
+      constexpr int64_t kSums = kBlockNodes * 4, kMoments = kBlockNodes * kContactMoments;
+      if (marks & kTouchedSums)
+        agree_on<uint64_t, double>(
+            agreed_sums_.data() + i * kSums, kSums, halo.count,
+            [&](int64_t r) { return ranks_[holder[r].rank].sums.data() + holder[r].slot * kSums; });
+      if (marks & kTouchedMoments)
+        agree_on<Word, T>(
+            agreed_moments_.data() + i * kMoments, kMoments, halo.count, [&](int64_t r) {
+              return ranks_[holder[r].rank].moments.data() + holder[r].slot * kMoments;
+            });
+    }
+  });
+}
+
+template <typename T>
+void RankCut<T>::end_colliders(std::vector<Given>& given) const {
+  std::stable_sort(given.begin(), given.end(),
+                   [](const Given& a, const Given& b) { return a.site < b.site; });
+  std::vector<double> sums(s_.collider_count * kImpulseSums, 0.0), chunk(sums.size(), 0.0);
+  const auto close = [&] {
+    for (size_t i = 0; i < sums.size(); ++i) sums[i] += chunk[i];
+    std::fill(chunk.begin(), chunk.end(), 0.0);
+  };
+  for (size_t i = 0; i < given.size(); ++i) {
+    if (i > 0 && given[i].site / kSiteChunk != given[i - 1].site / kSiteChunk) close();
+    for (int n = 0; n < kImpulseSums; ++n)
+      chunk[given[i].collider * kImpulseSums + n] += given[i].sums[n];
+  }
+  close();
+  for (int64_t k = 0; k < s_.collider_count; ++k)
+    end_collider(s_, k, sums.data() + k * kImpulseSums, s_.clock->dt);
+}
+
+template class RankCut<float>;
+template class RankCut<double>;
+
+}  // namespace gsf::cpu
