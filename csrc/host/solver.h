@@ -268,9 +268,22 @@ struct SolverOps {
     });
   }
 
+  // What each rank holds since the last build, [ranks, 4]: points, homes, slots, and slots that
+  // others hold too. CPU only.
+  static Tensor solver_ranks(Buffers buffers, std::vector<int64_t> ints,
+                             std::vector<double> floats) {
+    std::vector<Tensor> out;
+    call(buffers, ints, floats, [&](auto view, const auto&) {
+      out.push_back(new_zeros(buffers[kClock], {view.ranks, 4}, ScalarType::Long));
+      Backend::ranks(view, mptr<int64_t>(out[0]));
+    });
+    return out[0];
+  }
+
   static void register_all(Library& m) {
     GSF_IMPL(SolverOps, solver_prime);
     GSF_IMPL(SolverOps, solver_run);
+    if constexpr (Backend::kRanks) GSF_IMPL(SolverOps, solver_ranks);
   }
 
  private:

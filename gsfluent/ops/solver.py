@@ -248,7 +248,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
-        self.ranks = self._ranks(ranks, radius)
+        self.ranks = self._ranks(ranks, objects)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -352,7 +352,7 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(self, ranks: int, radius: Tensor | None) -> int:
+    def _ranks(self, ranks: int, objects: Tensor | None) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
         if type(ranks) is not int or not 1 <= ranks <= MOST_RANKS:
             raise InputError(
@@ -362,8 +362,7 @@ class Solver(SolverState):
         unknown = {
             f"device {self.device.type}": self.device.type != "cpu",
             "law phase_field (9)": self._law_set == DAMAGE_FIELD,
-            "flip": self.flip > 0.0,
-            "radius": radius is not None,
+            "objects": objects is not None,
         }
         found = [name for name, used in unknown.items() if used]
         if ranks > 1 and found:
@@ -497,6 +496,25 @@ class Solver(SolverState):
         slots = max(int(1.5 * now["wanted_slots"]) + 64, b.slot_next.shape[0])
         b.reserve_blocks(homes, slots, self.fields)
         self._write(grow=0, rebuild=1)
+
+    def rank_counts(self) -> list[dict[str, int]]:
+        """What each rank holds since the last build of blocks.
+
+        Returns:
+            Of each rank: ``points``, ``homes``, ``slots`` (blocks of nodes), and ``shared``: slots
+            that other ranks hold too and hear of in every step.
+
+        Raises:
+            InputError: On a GPU, or before the first step.
+        """
+        if self.device.type != "cpu" or self.clock()["slots"] == 0:
+            raise InputError(
+                "Solver.rank_counts: there are no ranks on a GPU, and nothing is cut before a step",
+                hint="advance a solver on the CPU first",
+            )
+        rows = torch.ops.gsfluent.solver_ranks(self._buffers.listed(), *self._settings())
+        names = ("points", "homes", "slots", "shared")
+        return [dict(zip(names, row, strict=True)) for row in rows.tolist()]
 
     # --- going back ---
 

@@ -2,7 +2,7 @@
 // compiled.
 #include "cpu/ranks/ranks.h"
 
-#include <bit>
+#include <cstring>
 
 namespace gsf::cpu {
 namespace {
@@ -17,25 +17,53 @@ W* row_at(W* array, int64_t first, int columns = 1) {
   return array != nullptr ? array + first * columns : nullptr;
 }
 
-// Brings the copies of some values to the bits that one of them has changed to. `agreed` are those
-// of all before; at most one copy of each value differs from them, so the order does not matter.
-template <typename Word, typename Value, typename Copy>
-void agree_on(Word* agreed, int64_t values, int64_t copies, const Copy& copy) {
-  static_assert(sizeof(Word) == sizeof(Value));
-  for (int64_t i = 0; i < values; ++i) {
-    Word changed = 0;
-    for (int64_t r = 0; r < copies; ++r) changed ^= std::bit_cast<Word>(copy(r)[i]) ^ agreed[i];
-    if (changed == 0) continue;
-    agreed[i] ^= changed;
-    for (int64_t r = 0; r < copies; ++r) copy(r)[i] = std::bit_cast<Value>(agreed[i]);
-  }
-}
-
 }  // namespace
 
-template <typename T>
-RankCut<T>::RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
-  if (!several()) ranks_[0].view = s;
+void Agreement::share(Touched mark, int64_t bytes, const std::vector<void*>& of_rank) {
+  if (std::all_of(of_rank.begin(), of_rank.end(), [](void* p) { return p == nullptr; })) return;
+  Array& array = arrays_.emplace_back();
+  array.mark = mark;
+  array.words = kBlockNodes * bytes / int64_t(sizeof(uint64_t));
+  for (void* p : of_rank) array.of_rank.push_back(static_cast<unsigned char*>(p));
+  array.agreed.resize(halos_.count() * array.words);
+}
+
+void Agreement::begin() {
+  for (Array& array : arrays_) std::fill(array.agreed.begin(), array.agreed.end(), 0);
+}
+
+void Agreement::agree() {
+  parallel_for(halos_.count(), kHaloGrain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      uint8_t marks = 0;
+      for (int64_t at = halos_.first[i]; at < halos_.first[i + 1]; ++at)
+        marks |= touched_[halos_.holders[at].rank][halos_.holders[at].slot];
+      for (int64_t at = halos_.first[i]; at < halos_.first[i + 1]; ++at)
+        touched_[halos_.holders[at].rank][halos_.holders[at].slot] = marks;
+      for (Array& array : arrays_)
+        if (marks & array.mark) agree(array, i);
+    }
+  });
+}
+
+void Agreement::agree(Array& array, int64_t halo) const {
+  uint64_t* agreed = array.agreed.data() + halo * array.words;
+  const auto holder = halos_.holders.begin();
+  const auto copy = [&](int64_t at) {
+    return array.of_rank[holder[at].rank] + holder[at].slot * array.words * sizeof(uint64_t);
+  };
+  const int64_t first = halos_.first[halo], end = halos_.first[halo + 1];
+  for (int64_t i = 0; i < array.words; ++i) {
+    uint64_t changed = 0, bits;
+    for (int64_t at = first; at < end; ++at) {
+      std::memcpy(&bits, copy(at) + i * sizeof bits, sizeof bits);
+      changed ^= bits ^ agreed[i];
+    }
+    if (changed == 0) continue;
+    agreed[i] ^= changed;
+    for (int64_t at = first; at < end; ++at)
+      std::memcpy(copy(at) + i * sizeof bits, agreed + i, sizeof bits);
+  }
 }
 
 template <typename T>
@@ -46,18 +74,15 @@ void RankCut<T>::make() {
     return;
   }
   site_key_.resize(c.sites);
-  site_of_slot_.assign(c.slots, -1);
   for (int64_t i = 0; i < c.sites; ++i) {
-    const int32_t* slots = s_.site_slots + kSiteFields * i;
-    const int32_t* b = s_.slot_coord + 4 * int64_t(slots[0]);
+    const int32_t* b =
+        s_.slot_coord + 4 * int64_t(std::max(slot(s_.site_slots[kSiteFields * i]), 0));
     site_key_[i] = block_key(b[0], b[1], b[2], 0);
-    for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
-      site_of_slot_[slots[f]] = static_cast<int32_t>(i);
   }
   answered_.assign(c.sites, 0);
   share_homes();
   for (Rank<T>& rank : ranks_) {
-    find_needed(rank);
+    find_held(rank);
     fill(rank);
   }
   find_halos();
@@ -81,13 +106,13 @@ void RankCut<T>::share_homes() {
 // of any field within two blocks, whoever needs it: which nodes fields share must not hang on the
 // cut, and contact looks at the nodes around.
 template <typename T>
-void RankCut<T>::find_needed(const Rank<T>& rank) {
+void RankCut<T>::find_held(const Rank<T>& rank) {
   held_.assign(s_.clock->slots, 0);
   const int32_t* last = nullptr;
   for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h) {
     for (int n = 0; n < kNeighbours; ++n) {
-      const int32_t slot = s_.neighbour[kNeighbours * h + n];
-      if (slot >= 0) held_[slot] |= kNeeded | kHeld;
+      const int32_t below = slot(s_.neighbour[kNeighbours * h + n]);
+      if (below >= 0) held_[below] = kNeeded;
     }
     const int32_t* b = s_.homes().coord + 4 * h;
     if (s_.fields == 1 || (last != nullptr && std::equal(b, b + 3, last))) continue;
@@ -97,55 +122,55 @@ void RankCut<T>::find_needed(const Rank<T>& rank) {
         const auto key = [&](int k) { return block_key(b[0] + i, b[1] + j, b[2] + k, 0); };
         auto at = std::lower_bound(site_key_.begin(), site_key_.end(), key(-kGhostBlocks));
         for (; at != site_key_.end() && *at <= key(kGhostBlocks); ++at) {
-          const int32_t* slots = s_.site_slots + kSiteFields * (at - site_key_.begin());
-          for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) held_[slots[f]] |= kHeld;
+          for (int f = 0; f < kSiteFields; ++f) {
+            const int32_t near = slot(s_.site_slots[kSiteFields * (at - site_key_.begin()) + f]);
+            if (near >= 0) held_[near] = std::max<uint8_t>(held_[near], kHeld);
+          }
         }
       }
   }
 }
 
-// The rank's own lists of what find_needed found, and its view.
+// The rank's own lists of what find_held found, and its view.
 template <typename T>
 void RankCut<T>::fill(Rank<T>& rank) {
   const HomeList<T>& list = s_.homes();
   const int64_t home = rank.first_home, end = home + rank.homes;
-  const int64_t first = home < s_.clock->homes ? list.start[home] : s_.count;
-  const int64_t last = end < s_.clock->homes ? list.start[end] : s_.count;
+  const auto start_of = [&](int64_t h) {
+    return h < s_.clock->homes ? std::clamp<int64_t>(list.start[h], 0, s_.count) : s_.count;
+  };
+  const int64_t first = start_of(home), last = std::max(first, start_of(end));
 
   std::vector<int32_t> number(s_.clock->slots, -1);
   rank.slots.clear();
   rank.slot_coord.clear();
   rank.slot_shared.clear();
-  for (int64_t slot = 0; slot < s_.clock->slots; ++slot) {
-    if (held_[slot] == 0) continue;
-    number[slot] = static_cast<int32_t>(rank.slots.size());
-    rank.slots.push_back(slot);
-    rank.slot_coord.insert(rank.slot_coord.end(), s_.slot_coord + 4 * slot,
-                           s_.slot_coord + 4 * slot + 4);
-    rank.slot_shared.push_back(s_.slot_shared[slot]);
+  for (int64_t i = 0; i < s_.clock->slots; ++i) {
+    if (held_[i] == 0) continue;
+    number[i] = static_cast<int32_t>(rank.slots.size());
+    rank.slots.push_back(i);
+    rank.slot_coord.insert(rank.slot_coord.end(), s_.slot_coord + 4 * i, s_.slot_coord + 4 * i + 4);
+    rank.slot_shared.push_back(s_.slot_shared[i]);
   }
+  const auto own = [&](int32_t of_all) { return slot(of_all) >= 0 ? number[of_all] : -1; };
   rank.sites = {};
   rank.site_slots.clear();
   for (int64_t i = 0; i < s_.clock->sites; ++i) {
     const int32_t* slots = s_.site_slots + kSiteFields * i;
-    bool needed = false;
-    for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
-      needed = needed || (held_[slots[f]] & kNeeded) != 0;
-    if (!needed) continue;
+    if (std::none_of(slots, slots + kSiteFields,
+                     [&](int32_t of_all) { return slot(of_all) >= 0 && held_[of_all] == kNeeded; }))
+      continue;
     rank.sites.number.push_back(i);
     rank.sites.answers.push_back(answered_[i] == 0 ? 1 : 0);
     answered_[i] = 1;
-    for (int f = 0; f < kSiteFields; ++f)
-      rank.site_slots.push_back(slots[f] >= 0 ? number[slots[f]] : -1);
+    for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
   }
   rank.home_start.resize(rank.homes);
   rank.neighbour.resize(kNeighbours * rank.homes);
   for (int64_t h = 0; h < rank.homes; ++h)
     rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - first);
-  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i) {
-    const int32_t slot = s_.neighbour[kNeighbours * home + i];
-    rank.neighbour[i] = slot >= 0 ? number[slot] : -1;
-  }
+  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i)
+    rank.neighbour[i] = own(s_.neighbour[kNeighbours * home + i]);
   const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
   rank.touched.assign(rank.slots.size(), 0);
   rank.sums.assign(4 * nodes, 0.0);
@@ -167,6 +192,7 @@ void RankCut<T>::fill(Rank<T>& rank) {
   v.peak = row_at(s_.peak, first);
   v.deformation = row_at(s_.deformation, first, 9);
   v.viscous = row_at(s_.viscous, first, kViscousColumns);
+  v.own = row_at(s_.own, first, 9);
   v.id = row_at(s_.id, first);
   v.entry = row_at(s_.entry, first);
   v.home[0] = v.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
@@ -182,53 +208,23 @@ void RankCut<T>::fill(Rank<T>& rank) {
 
 template <typename T>
 void RankCut<T>::find_halos() {
-  std::vector<std::vector<Holder>> holders(s_.clock->slots);
+  std::vector<std::vector<Halos::Holder>> holders(s_.clock->slots);
   for (size_t r = 0; r < ranks_.size(); ++r)
     for (size_t i = 0; i < ranks_[r].slots.size(); ++i)
       holders[ranks_[r].slots[i]].push_back({static_cast<int32_t>(r), static_cast<int32_t>(i)});
-  halos_.clear();
-  holders_.clear();
-  for (const std::vector<Holder>& of_slot : holders) {
+  halos_.first.assign(1, 0);
+  halos_.holders.clear();
+  for (const std::vector<Halos::Holder>& of_slot : holders) {
     if (of_slot.size() < 2) continue;
-    halos_.push_back({static_cast<int64_t>(holders_.size()), static_cast<int64_t>(of_slot.size())});
-    holders_.insert(holders_.end(), of_slot.begin(), of_slot.end());
+    halos_.holders.insert(halos_.holders.end(), of_slot.begin(), of_slot.end());
+    halos_.first.push_back(static_cast<int64_t>(halos_.holders.size()));
   }
-  agreed_sums_.assign(halos_.size() * kBlockNodes * 4, 0);
-  agreed_moments_.assign(s_.moments != nullptr ? halos_.size() * kBlockNodes * kContactMoments : 0,
-                         0);
 }
 
 template <typename T>
 void RankCut<T>::begin() {
   if (!several()) return;
   for (Rank<T>& rank : ranks_) rank.tell(*s_.clock);
-  std::fill(agreed_sums_.begin(), agreed_sums_.end(), 0);
-  std::fill(agreed_moments_.begin(), agreed_moments_.end(), 0);
-}
-
-template <typename T>
-void RankCut<T>::agree() {
-  parallel_for(static_cast<int64_t>(halos_.size()), kHaloGrain, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const Halo& halo = halos_[i];
-      const Holder* holder = holders_.data() + halo.first;
-      uint8_t marks = 0;
-      for (int64_t r = 0; r < halo.count; ++r)
-        marks |= ranks_[holder[r].rank].touched[holder[r].slot];
-      for (int64_t r = 0; r < halo.count; ++r)
-        ranks_[holder[r].rank].touched[holder[r].slot] = marks;
-      constexpr int64_t kSums = kBlockNodes * 4, kMoments = kBlockNodes * kContactMoments;
-      if (marks & kTouchedSums)
-        agree_on<uint64_t, double>(
-            agreed_sums_.data() + i * kSums, kSums, halo.count,
-            [&](int64_t r) { return ranks_[holder[r].rank].sums.data() + holder[r].slot * kSums; });
-      if (marks & kTouchedMoments)
-        agree_on<Word, T>(
-            agreed_moments_.data() + i * kMoments, kMoments, halo.count, [&](int64_t r) {
-              return ranks_[holder[r].rank].moments.data() + holder[r].slot * kMoments;
-            });
-    }
-  });
 }
 
 template <typename T>

@@ -33,49 +33,82 @@ struct Rank {
   }
 };
 
+// Slots that several ranks hold.
+struct Halos {
+  struct Holder {
+    int32_t rank, slot;
+  };
+  std::vector<int64_t> first{0};  // [halos + 1] of the holders of each
+  std::vector<Holder> holders;
+
+  int64_t count() const { return static_cast<int64_t>(first.size()) - 1; }
+};
+
+// Brings what ranks added to the slots that they share to all of them: after each colour of homes,
+// in which at most one of them changed each value. So it does not matter in which order their bits
+// meet, and an exclusive or of the changes finds them.
+class Agreement {
+ public:
+  explicit Agreement(const Halos& halos) : halos_(halos) {}
+
+  // Again after each build: the marks of each rank's slots,
+  void plan(std::vector<uint8_t*> touched) {
+    touched_ = std::move(touched);
+    arrays_.clear();
+  }
+  // and arrays of theirs, which are there in slots with this mark and hold `bytes` of each node.
+  void share(Touched mark, int64_t bytes, const std::vector<void*>& of_rank);
+  // Before the first colour; all values are zero.
+  void begin();
+  void agree();
+
+ private:
+  struct Array {
+    uint8_t mark;
+    int64_t words;  // of each slot
+    std::vector<unsigned char*> of_rank;
+    std::vector<uint64_t> agreed;  // [halos, words]
+  };
+  void agree(Array& array, int64_t halo) const;
+
+  const Halos& halos_;
+  std::vector<uint8_t*> touched_;
+  std::vector<Array> arrays_;
+};
+
 template <typename T>
 class RankCut {
  public:
-  explicit RankCut(const SolverView<T>& s);
+  explicit RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
+    for (Rank<T>& rank : ranks_) rank.view = s;
+  }
 
   // As many as the scene has; they stay where they are.
   std::vector<Rank<T>>& ranks() { return ranks_; }
+  const Halos& halos() const { return halos_; }
   bool several() const { return ranks_.size() > 1; }
 
   // What each rank holds; again after each build.
   void make();
   // Before a step: each rank learns the time and the health of all.
   void begin();
-  // After each colour of homes: all that hold a slot get what one of them added to it.
-  void agree();
   // After the nodes of all ranks: what colliders got, which is booked in the order of all sites.
   void end_colliders(std::vector<Given>& given) const;
 
  private:
-  using Word = std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t>;
-  struct Holder {
-    int32_t rank, slot;
-  };
-  // A slot that several ranks hold.
-  struct Halo {
-    int64_t first, count;  // holders
-  };
-
+  // The slot of all with this number, or -1 for what is none.
+  int32_t slot(int32_t number) const { return number < s_.clock->slots ? number : -1; }
   void share_homes();
-  void find_needed(const Rank<T>& rank);
+  void find_held(const Rank<T>& rank);
   void fill(Rank<T>& rank);
   void find_halos();
 
   const SolverView<T>& s_;
   std::vector<Rank<T>> ranks_;
-  std::vector<uint64_t> site_key_;     // [all sites] ascending
-  std::vector<int32_t> site_of_slot_;  // [all slots]
-  std::vector<uint8_t> held_;          // [all slots] kHeld, kNeeded of the rank at hand
-  std::vector<uint8_t> answered_;      // [all sites] some rank answers for it
-  std::vector<Halo> halos_;
-  std::vector<Holder> holders_;
-  std::vector<uint64_t> agreed_sums_;  // [halos, 64, 4] bits
-  std::vector<Word> agreed_moments_;   // [halos, 64, kContactMoments] bits
+  std::vector<uint64_t> site_key_;  // [all sites] ascending
+  std::vector<uint8_t> held_;       // [all slots] Held, by the rank at hand
+  std::vector<uint8_t> answered_;   // [all sites] some rank answers for it
+  Halos halos_;
 };
 
 }  // namespace gsf::cpu

@@ -55,16 +55,9 @@ class HomePass {
     box_.assign(s_.clock->homes, Box{});
   }
 
-  // Adds every particle to the sums of its nodes and marks the slots. Particles of homes with nodes
-  // that have no slot count as lost.
-  Counts to_nodes(std::vector<uint8_t>& touched) {
-    begin();
-    Counts all;
-    for (int color = 0; color < kColors; ++color) all.add(to_nodes(color, touched));
-    return all;
-  }
-  // The same in parts: what comes first, then the homes of each colour. A node gets at most one
-  // addend from each, so ranks that share nodes can agree in between.
+  // Adds every particle to the sums of its nodes and marks the slots: what comes first, then the
+  // homes of each colour. A node gets at most one addend from each, so that ranks which share nodes
+  // can agree in between. Particles of homes with nodes that have no slot count as lost.
   void begin() { touch_.run(); }
   Counts to_nodes(int color, std::vector<uint8_t>& touched) {
     const std::vector<int32_t>& homes = colors_[color];
