@@ -8,7 +8,6 @@ namespace gsf::cpu {
 namespace {
 
 constexpr int64_t kHaloGrain = 16;
-constexpr int kGhostBlocks = 2;  // beyond its own blocks: what they reach, and one more for contact
 enum Held : uint8_t { kHeld = 1, kNeeded = 2 };
 
 // Row `first` of an array with so many columns that may be absent.
@@ -73,11 +72,10 @@ void RankCut<T>::make() {
     ranks_[0].touched.assign(c.slots, 0);
     return;
   }
-  site_key_.resize(c.sites);
-  for (int64_t i = 0; i < c.sites; ++i) {
-    const int32_t* b =
-        s_.slot_coord + 4 * int64_t(std::max(slot(s_.site_slots[kSiteFields * i]), 0));
-    site_key_[i] = block_key(b[0], b[1], b[2], 0);
+  slot_key_.resize(c.slots);
+  for (int64_t i = 0; i < c.slots; ++i) {
+    const int32_t* b = s_.slot_coord + 4 * i;
+    slot_key_[i] = block_key(b[0], b[1], b[2], b[3]);
   }
   answered_.assign(c.sites, 0);
   share_homes();
@@ -102,32 +100,46 @@ void RankCut<T>::share_homes() {
   }
 }
 
-// Slots under the windows of a rank's homes. Where several fields may meet it also holds every slot
-// of any field within two blocks, whoever needs it: which nodes fields share must not hang on the
-// cut, and contact looks at the nodes around.
+template <typename T>
+bool RankCut<T>::needed(const int32_t* slots) const {
+  return std::any_of(slots, slots + kSiteFields,
+                     [&](int32_t i) { return slot(i) >= 0 && held_[slot(i)] == kNeeded; });
+}
+
+// Slots under the windows of a rank's homes, which it needs. Where fields may meet it also holds
+// what its share of contact hangs on, whoever needs it: every field at the sites of what it needs,
+// the nodes around those that fields share, and whether a block next to its homes is shared.
 template <typename T>
 void RankCut<T>::find_held(const Rank<T>& rank) {
   held_.assign(s_.clock->slots, 0);
-  const int32_t* last = nullptr;
-  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h) {
+  const auto hold = [&](int64_t i) { held_[i] = std::max<uint8_t>(held_[i], kHeld); };
+  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
     for (int n = 0; n < kNeighbours; ++n) {
       const int32_t below = slot(s_.neighbour[kNeighbours * h + n]);
       if (below >= 0) held_[below] = kNeeded;
     }
-    const int32_t* b = s_.homes().coord + 4 * h;
-    if (s_.fields == 1 || (last != nullptr && std::equal(b, b + 3, last))) continue;
-    last = b;
-    for (int i = -kGhostBlocks; i <= kGhostBlocks; ++i)
-      for (int j = -kGhostBlocks; j <= kGhostBlocks; ++j) {
-        const auto key = [&](int k) { return block_key(b[0] + i, b[1] + j, b[2] + k, 0); };
-        auto at = std::lower_bound(site_key_.begin(), site_key_.end(), key(-kGhostBlocks));
-        for (; at != site_key_.end() && *at <= key(kGhostBlocks); ++at) {
-          for (int f = 0; f < kSiteFields; ++f) {
-            const int32_t near = slot(s_.site_slots[kSiteFields * (at - site_key_.begin()) + f]);
-            if (near >= 0) held_[near] = std::max<uint8_t>(held_[near], kHeld);
-          }
-        }
-      }
+  if (s_.fields == 1) return;
+  const auto around = [&](const int32_t* b, const auto& f) {
+    for (int n = 0; n < kNeighbours; ++n) {
+      const uint64_t key =
+          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+      const auto at = std::lower_bound(slot_key_.begin(), slot_key_.end(), key);
+      if (at != slot_key_.end() && *at == key) f(at - slot_key_.begin());
+    }
+  };
+  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+    around(s_.homes().coord + 4 * h, [&](int64_t i) {
+      if (s_.slot_shared[i] != 0) hold(i);
+    });
+  for (int64_t i = 0; i < s_.clock->sites; ++i) {
+    const int32_t* slots = s_.site_slots + kSiteFields * i;
+    if (!needed(slots)) continue;
+    for (int f = 0; f < kSiteFields; ++f) {
+      const int32_t here = slot(slots[f]);
+      if (here < 0) continue;
+      hold(here);
+      if (s_.slot_shared[here] != 0) around(s_.slot_coord + 4 * int64_t(here), hold);
+    }
   }
 }
 
@@ -157,9 +169,7 @@ void RankCut<T>::fill(Rank<T>& rank) {
   rank.site_slots.clear();
   for (int64_t i = 0; i < s_.clock->sites; ++i) {
     const int32_t* slots = s_.site_slots + kSiteFields * i;
-    if (std::none_of(slots, slots + kSiteFields,
-                     [&](int32_t of_all) { return slot(of_all) >= 0 && held_[of_all] == kNeeded; }))
-      continue;
+    if (!needed(slots)) continue;
     rank.sites.number.push_back(i);
     rank.sites.answers.push_back(answered_[i] == 0 ? 1 : 0);
     answered_[i] = 1;

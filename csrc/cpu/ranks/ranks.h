@@ -98,6 +98,8 @@ class RankCut {
  private:
   // The slot of all with this number, or -1 for what is none.
   int32_t slot(int32_t number) const { return number < s_.clock->slots ? number : -1; }
+  // Whether the rank at hand needs one of the slots of a site.
+  bool needed(const int32_t* slots) const;
   void share_homes();
   void find_held(const Rank<T>& rank);
   void fill(Rank<T>& rank);
@@ -105,7 +107,7 @@ class RankCut {
 
   const SolverView<T>& s_;
   std::vector<Rank<T>> ranks_;
-  std::vector<uint64_t> site_key_;  // [all sites] ascending
+  std::vector<uint64_t> slot_key_;  // [all slots] ascending
   std::vector<uint8_t> held_;       // [all slots] Held, by the rank at hand
   std::vector<uint8_t> answered_;   // [all sites] some rank answers for it
   Halos halos_;
