@@ -81,7 +81,8 @@ enum SolverFloat : int {
   kFlip,
   kSolverFloats
 };
-enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kSolverInts };
+constexpr int64_t kMostRanks = 64;
+enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kRanks, kSolverInts };
 
 template <class Backend>
 struct SolverOps {
@@ -186,6 +187,9 @@ struct SolverOps {
     const auto any_at = [&](int i) -> void* {
       return b[i].numel() ? b[i].mutable_data_ptr() : nullptr;
     };
+    s.ranks = static_cast<int32_t>(ints[kRanks]);
+    STD_TORCH_CHECK(ints[kRanks] >= 1 && ints[kRanks] <= (device ? 1 : kMostRanks),
+                    "solver: ranks must be 1 to ", kMostRanks, ", and 1 on a GPU");
     s.fields = static_cast<int32_t>(ints[kFields]);
     STD_TORCH_CHECK(s.fields >= 1 && s.fields < kMaxSolverFields, "solver: fields must be 1 to ",
                     kMaxSolverFields - 1);
@@ -285,9 +289,22 @@ struct SolverOps {
     });
   }
 
+  // What each rank holds since the last build, [ranks, 4]: points, homes, slots, and slots that
+  // others hold too. CPU only.
+  static Tensor solver_ranks(Buffers buffers, std::vector<int64_t> ints,
+                             std::vector<double> floats) {
+    std::vector<Tensor> out;
+    call(buffers, ints, floats, [&](auto view, const auto&) {
+      out.push_back(new_zeros(buffers[kClock], {view.ranks, 4}, ScalarType::Long));
+      Backend::ranks(view, mptr<int64_t>(out[0]));
+    });
+    return out[0];
+  }
+
   static void register_all(Library& m) {
     GSF_IMPL(SolverOps, solver_prime);
     GSF_IMPL(SolverOps, solver_run);
+    if constexpr (Backend::kRanks) GSF_IMPL(SolverOps, solver_ranks);
   }
 
  private:

@@ -40,6 +40,8 @@ CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
 RADIUS_MOST = 0.5
 """Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
+MOST_RANKS = 64
+"""``kMostRanks`` of ``csrc/host/solver.h``."""
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -142,6 +144,9 @@ class Solver(SolverState):
             With colliders 0. Default: without them that of the matter, each body by its mass, so
             that what happens does not depend on who watches (docs/theory/mpm.md). Positions and
             velocities are given and read as they are for the observer.
+        ranks: Parts that the scene is cut into at every build and that step side by side, telling
+            each other what they share (docs/theory/ranks.md): the same bits for any number. In
+            lockstep on one CPU, which is slower than 1; the rehearsal for several devices. 1 to 64.
 
     Raises:
         TypeError: Wrong type or dtype.
@@ -185,6 +190,7 @@ class Solver(SolverState):
         irreversible: bool = True,
         flip: float = 0.0,
         frame: Sequence[float] | None = None,
+        ranks: int = 1,
     ) -> None:
         op = "Solver"
         check_tensor(op, "position", position, shape=(None, 3))
@@ -242,6 +248,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
+        self.ranks = self._ranks(ranks, objects)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -344,6 +351,26 @@ class Solver(SolverState):
             )
         return float(share)
 
+    def _ranks(self, ranks: int, objects: Tensor | None) -> int:
+        """The number of ranks, checked, and that every part of the scene knows of them."""
+        if type(ranks) is not int or not 1 <= ranks <= MOST_RANKS:
+            raise InputError(
+                f"Solver: ranks must be a whole number of 1 to {MOST_RANKS}, got {ranks!r}",
+                hint="1 steps the whole scene at once",
+            )
+        unknown = {
+            f"device {self.device.type}": self.device.type != "cpu",
+            "law phase_field (9)": self._law_set == DAMAGE_FIELD,
+            "objects": objects is not None,
+        }
+        found = [name for name, used in unknown.items() if used]
+        if ranks > 1 and found:
+            raise InputError(
+                f"Solver: {ranks} ranks do not know {' and '.join(found)} yet",
+                hint="leave out ranks, or what they do not know",
+            )
+        return ranks
+
     @staticmethod
     def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:
         """Refuse contact radii that are too large or no numbers."""
@@ -365,7 +392,8 @@ class Solver(SolverState):
             )
 
     def _settings(self) -> tuple[list[int], list[float]]:
-        ints = [self.fields, int(self.implicit), int(self.irreversible), self._law_set]
+        ints = [self.fields, int(self.implicit), int(self.irreversible), self._law_set,
+                self.ranks]  # fmt: skip
         floats = [
             self.dx, *self.gravity, self.friction, self.restitution, self.contact_gap, self.k,
             self.epsilon, self.flip,
@@ -462,6 +490,25 @@ class Solver(SolverState):
         slots = max(int(1.5 * now["wanted_slots"]) + 64, b.slot_next.shape[0])
         b.reserve_blocks(homes, slots, self.fields)
         self._write(grow=0, rebuild=1)
+
+    def rank_counts(self) -> list[dict[str, int]]:
+        """What each rank holds since the last build of blocks.
+
+        Returns:
+            Of each rank: ``points``, ``homes``, ``slots`` (blocks of nodes), and ``shared``: slots
+            that other ranks hold too and hear of in every step.
+
+        Raises:
+            InputError: On a GPU, or before the first step.
+        """
+        if self.device.type != "cpu" or self.clock()["slots"] == 0:
+            raise InputError(
+                "Solver.rank_counts: there are no ranks on a GPU, and nothing is cut before a step",
+                hint="advance a solver on the CPU first",
+            )
+        rows = torch.ops.gsfluent.solver_ranks(self._buffers.listed(), *self._settings())
+        names = ("points", "homes", "slots", "shared")
+        return [dict(zip(names, row, strict=True)) for row in rows.tolist()]
 
     # --- going back ---
 

@@ -141,6 +141,7 @@ template <typename T>
 struct SolverView {
   int64_t count, home_capacity, slot_capacity, table_size, row_count, collider_count;
   int32_t fields;
+  int32_t ranks;  // CPU only: in lockstep (cpu/ranks)
   T dx, inv_dx;
   T gravity[3];
   ContactLaw contact;

@@ -23,7 +23,8 @@ SolverView<T> untouched(const SolverView<T>& s) {
 template <typename T>
 struct FlipPass<T>::Passes {
   explicit Passes(const SolverView<T>& s)
-      : view(untouched(s)),
+      : of(s),
+        view(untouched(s)),
         contact(view),
         surface(view),
         touch(view, contact),
@@ -72,6 +73,7 @@ struct FlipPass<T>::Passes {
     }
   }
 
+  const SolverView<T>& of;
   SolverView<T> view;
   ContactPlan<T> contact;
   SurfacePlan<T> surface;
@@ -90,6 +92,7 @@ FlipPass<T>::~FlipPass() = default;
 template <typename T>
 void FlipPass<T>::plan() {
   Passes& p = *passes_;
+  p.view = untouched(p.of);
   const int64_t slots = p.view.clock->slots;
   p.touched.assign(slots, 0);
   p.sums.assign(slots * kBlockNodes * 4, 0.0);
@@ -102,24 +105,30 @@ void FlipPass<T>::plan() {
 }
 
 template <typename T>
+Counts FlipPass<T>::to_nodes(int color) {
+  return passes_->homes.to_nodes(color, passes_->touched);
+}
+template <typename T>
+double* FlipPass<T>::sums() {
+  return passes_->sums.data();
+}
+template <typename T>
+uint8_t* FlipPass<T>::touched() {
+  return passes_->touched.data();
+}
+
+template <typename T>
 Counts FlipPass<T>::from_nodes(const HomePass<T>& homes, int laws) {
   Passes& p = *passes_;
-  Counts all = p.homes.to_nodes(p.touched);
   p.nodes();
   parallel_for(p.view.clock->homes, kHomeGrain, [&](int64_t begin, int64_t end) {
     for (int64_t h = begin; h < end; ++h) p.keep(h);
   });
-  if (laws == kElasticOnly)
-    all.add(homes.template from_nodes<kElasticOnly, true>());
-  else if (laws == kBrittle)
-    all.add(homes.template from_nodes<kBrittle, true>());
-  else if (laws == kMoreLaws)
-    all.add(homes.template from_nodes<kMoreLaws, true>());
-  else if (with_springs(laws))
-    all.add(homes.template from_nodes<kViscousAny, true>());
-  else
-    all.add(homes.template from_nodes<kAnyLaw, true>());
-  return all;
+  if (laws == kElasticOnly) return homes.template from_nodes<kElasticOnly, true>();
+  if (laws == kBrittle) return homes.template from_nodes<kBrittle, true>();
+  if (laws == kMoreLaws) return homes.template from_nodes<kMoreLaws, true>();
+  if (with_springs(laws)) return homes.template from_nodes<kViscousAny, true>();
+  return homes.template from_nodes<kAnyLaw, true>();
 }
 
 template class FlipPass<float>;

@@ -17,9 +17,14 @@ class FlipPass {
   FlipPass& operator=(const FlipPass&) = delete;
 
   void plan();  // again after each build
-  // HomePass::from_nodes with laws other than kDamageField. Takes from each particle's velocity and
-  // `own` what would come back if nothing acted on the nodes, and leaves the share of it that is
-  // kept; keep_own (core/solver/particle.h) adds what did come back.
+  // HomePass::to_nodes of what would go on if nothing acted on it, to nodes apart from those of the
+  // step: the homes of one colour, and the sums and marks they go to.
+  Counts to_nodes(int color);
+  double* sums();
+  uint8_t* touched();
+  // Then HomePass::from_nodes with laws other than kDamageField. Takes from each particle's
+  // velocity and `own` what would come back if nothing acted on the nodes, and leaves the share of
+  // it that is kept; keep_own (core/solver/particle.h) adds what did come back.
   Counts from_nodes(const HomePass<T>& homes, int laws);
 
  private:

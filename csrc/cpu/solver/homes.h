@@ -55,18 +55,17 @@ class HomePass {
     box_.assign(s_.clock->homes, Box{});
   }
 
-  // Adds every particle to the sums of its nodes and marks the slots. Particles of homes with nodes
-  // that have no slot count as lost.
-  Counts to_nodes(std::vector<uint8_t>& touched) {
-    Counts all;
-    touch_.run();
-    for (const std::vector<int32_t>& homes : colors_)
-      all.add(parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,
-                              [&](int64_t begin, int64_t end, Counts& counts) {
-                                for (int64_t i = begin; i < end; ++i)
-                                  if (!home_to_nodes(homes[i], touched)) ++counts.lost;
-                              }));
-    return all;
+  // Adds every particle to the sums of its nodes and marks the slots: what comes first, then the
+  // homes of each colour. A node gets at most one addend from each, so that ranks which share nodes
+  // can agree in between. Particles of homes with nodes that have no slot count as lost.
+  void begin() { touch_.run(); }
+  Counts to_nodes(int color, std::vector<uint8_t>& touched) {
+    const std::vector<int32_t>& homes = colors_[color];
+    return parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,
+                           [&](int64_t begin, int64_t end, Counts& counts) {
+                             for (int64_t i = begin; i < end; ++i)
+                               if (!home_to_nodes(homes[i], touched)) ++counts.lost;
+                           });
   }
 
   // Updates every particle from the velocities of its nodes.

@@ -1,6 +1,8 @@
 // Nodes of the resident solver on the CPU: sums to velocities, contact, colliders, site by site.
 #pragma once
 
+#include <numeric>
+
 #include "core/solver/points.h"
 #include "cpu/contact/points.h"
 #include "cpu/solver/surface.h"
@@ -11,21 +13,35 @@ constexpr int64_t kSlotGrain = 64;
 constexpr int64_t kSiteChunk = 16;  // sites per ordered partial sum; fixed, so that sums are too
 constexpr int64_t kNearColliders = 64;  // with more, every site looks at all of them
 
+// What one node gave to a collider, on its way from one rank of several to the sums of all.
+struct Given {
+  int64_t site;  // its number among the sites of all ranks
+  int64_t collider;
+  double sums[kImpulseSums];
+};
+// Sites of one rank of several. Others that hold a site compute the same there; one answers for it.
+struct RankSites {
+  std::vector<uint8_t> answers;  // [sites]
+  std::vector<int64_t> number;   // [sites] among those of all ranks
+};
+
 template <typename T>
 class NodePass {
  public:
   NodePass(const SolverView<T>& s, const ContactPlan<T>& contact, SurfacePlan<T>& surface,
-           TouchPlan<T>& touch)
-      : s_(s), contact_(contact), surface_(surface), touch_(touch) {}
+           TouchPlan<T>& touch, const RankSites* sites)
+      : s_(s), contact_(contact), surface_(surface), touch_(touch), sites_(sites) {}
 
   void plan() {
     const int64_t chunks = (s_.clock->sites + kSiteChunk - 1) / kSiteChunk;
     impulse_.assign(chunks * s_.collider_count * kImpulseSums, 0.0);
     contacts_.assign(chunks, 0);
+    given_.resize(sites_ != nullptr ? chunks : 0);
   }
 
-  // All nodes of touched slots; clears their sums and the marks.
-  void run(T dt, std::vector<uint8_t>& touched) {
+  // All nodes of touched slots; clears their sums and the marks. Returns how many were touched by
+  // several fields.
+  int64_t run(T dt, std::vector<uint8_t>& touched) {
     SolverClock& c = *s_.clock;
     const int64_t chunks = static_cast<int64_t>(contacts_.size()),
                   terms = kImpulseSums * s_.collider_count;
@@ -34,14 +50,26 @@ class NodePass {
         double* impulse = impulse_.data() + chunk * terms;
         std::fill(impulse, impulse + terms, 0.0);
         contacts_[chunk] = 0;
+        Account account{impulse, nullptr, 0};
+        if (sites_ != nullptr) {
+          given_[chunk].clear();
+          account.list = &given_[chunk];
+        }
         const int64_t last = std::min((chunk + 1) * kSiteChunk, c.sites);
         for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
           const Site here = site(index, touched);
           if (here.fields == 0) continue;
           int marks = 0;
           for (int i = 0; i < here.fields; ++i) marks |= touched[here.slots[i]];
+          if (sites_ != nullptr) account.site = sites_->number[index];
+          const size_t before = sites_ != nullptr ? account.list->size() : 0;
+          int64_t contacts = 0;
           for (int local = 0; local < kBlockNodes; ++local)
-            contacts_[chunk] += node(here, local, marks, dt, impulse);
+            contacts += node(here, local, marks, dt, account);
+          if (sites_ == nullptr || sites_->answers[index] != 0)
+            contacts_[chunk] += contacts;
+          else
+            account.list->resize(before);
         }
       }
     });
@@ -59,19 +87,41 @@ class NodePass {
         touched[b] = 0;
       }
     });
-    for (int64_t chunk = 0; chunk < chunks; ++chunk) {
-      c.touched += contacts_[chunk];
-    }
+    return std::accumulate(contacts_.begin(), contacts_.end(), int64_t(0));
+  }
+
+  // After run, in the one rank that holds all: books what colliders got, and moves them.
+  void end_colliders() {
+    const int64_t terms = kImpulseSums * s_.collider_count;
     for (int64_t k = 0; k < s_.collider_count; ++k) {
       double sums[kImpulseSums] = {};
-      for (int64_t chunk = 0; chunk < chunks; ++chunk)
+      for (size_t chunk = 0; chunk < contacts_.size(); ++chunk)
         for (int i = 0; i < kImpulseSums; ++i)
           sums[i] += impulse_[chunk * terms + k * kImpulseSums + i];
-      end_collider(s_, k, sums, c.dt);
+      end_collider(s_, k, sums, s_.clock->dt);
     }
+  }
+  // After run, in one rank of several: what colliders got, in the order of its sites.
+  void give(std::vector<Given>& all) const {
+    for (const std::vector<Given>& chunk : given_)
+      all.insert(all.end(), chunk.begin(), chunk.end());
   }
 
  private:
+  // Where what a chunk of sites gives goes: to the sums of each collider, or, in one rank of
+  // several, one by one to a list, so that all of it can be added in the order of all sites.
+  struct Account {
+    double* impulse;
+    std::vector<Given>* list;
+    int64_t site;
+
+    double* of(int64_t k) {
+      if (list == nullptr) return impulse + kImpulseSums * k;
+      list->push_back({site, k, {}});
+      return list->back().sums;
+    }
+  };
+
   // One site: its slots that got anything in this step, and the colliders that can touch it.
   struct Site {
     int32_t slots[kSiteFields];
@@ -112,7 +162,7 @@ class NodePass {
   }
 
   // One node of a site: velocities, contact, colliders. Returns whether fields touched.
-  int64_t node(const Site& site, int local, int marks, T dt, double* impulse) {
+  int64_t node(const Site& site, int local, int marks, T dt, Account& account) {
     const double* sums = static_cast<const double*>(s_.sums);
     const int fields = site.fields;
     double mass[kSiteFields];
@@ -144,14 +194,14 @@ class NodePass {
         for (int a = 0; a < fields; ++a)
           if (heavy[a] && holds_node(s_, k, x))
             node_collide(s_, k, x, mass[a], node_cut(s_, fields, heavy, number, a), dt, velocity[a],
-                         impulse + kImpulseSums * k);
+                         account.of(k));
       }
     }
     if ((marks & kTouchedPush) != 0) {
       const auto nearest = [&] { return surface_.nearest(x); };
-      const auto account = [&](int64_t k) { return impulse + kImpulseSums * k; };
+      const auto sums_of = [&](int64_t k) { return account.of(k); };
       node_rub(s_, fields, heavy, number, weight, given(site, local, surface_.sums()), x, nearest,
-               account, velocity);
+               sums_of, velocity);
     }
     for (int a = 0; a < fields; ++a) {
       T* out = s_.node_velocity + 4 * (int64_t(site.slots[a]) * kBlockNodes + local);
@@ -172,8 +222,10 @@ class NodePass {
   const ContactPlan<T>& contact_;
   SurfacePlan<T>& surface_;
   TouchPlan<T>& touch_;
-  std::vector<double> impulse_;    // [chunks, colliders, kImpulseSums]
-  std::vector<int64_t> contacts_;  // [chunks] nodes at which fields touched
+  const RankSites* sites_;                 // null: all sites are here
+  std::vector<double> impulse_;            // [chunks, colliders, kImpulseSums]
+  std::vector<int64_t> contacts_;          // [chunks] nodes at which fields touched
+  std::vector<std::vector<Given>> given_;  // [chunks] of one rank of several
 };
 
 }  // namespace gsf::cpu

@@ -2,8 +2,8 @@
 #include "host/solver.h"
 
 #include "cpu/mpm/flip.h"
+#include "cpu/ranks/ranks.h"
 #include "cpu/solver/homes.h"
-#include "cpu/solver/nodes.h"
 
 namespace gsf::cpu {
 namespace {
@@ -18,28 +18,25 @@ void give_largest(const Largest& l, SolverClock& c) {
   c.gradient = std::max<uint64_t>(c.gradient, bits_of(std::sqrt(l.gradient2)));
 }
 
+// What one rank does in a step.
 template <typename T>
 class Stepper {
  public:
-  Stepper(const SolverView<T>& s, int laws)
-      : s_(s),
+  Stepper(Rank<T>& rank, int laws, bool several)
+      : s_(rank.view),
         laws_(laws),
-        contact_(s),
-        surface_(s),
-        touch_(s, contact_),
-        homes_(s, contact_, surface_, touch_),
-        nodes_(s, contact_, surface_, touch_) {
-    if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s);
-    if (s.own != nullptr) flip_ = std::make_unique<FlipPass<T>>(s);
+        touched_(rank.touched),
+        contact_(s_),
+        surface_(s_),
+        touch_(s_, contact_),
+        homes_(s_, contact_, surface_, touch_),
+        nodes_(s_, contact_, surface_, touch_, several ? &rank.sites : nullptr) {
+    if (laws == kDamageField) fields_ = std::make_unique<FieldPass<T>>(s_);
+    if (s_.own != nullptr) flip_ = std::make_unique<FlipPass<T>>(s_);
   }
 
   // Everything that follows from the blocks; again after each build.
   void plan() {
-    const SolverClock& c = *s_.clock;
-    STD_TORCH_CHECK(c.homes >= 0 && c.homes <= s_.home_capacity && c.slots >= 0 &&
-                        c.slots <= s_.slot_capacity && c.sites >= 0 && c.sites <= c.slots,
-                    "solver: the clock counts more blocks than there is room for");
-    touched_.assign(c.slots, 0);
     contact_.make();
     surface_.make();
     touch_.make();
@@ -49,14 +46,79 @@ class Stepper {
     if (flip_) flip_->plan();
   }
 
+  void begin() { homes_.begin(); }
+  Counts to_nodes(int color) { return homes_.to_nodes(color, touched_); }
+  T* pushes() { return surface_.sums(); }
+  int64_t nodes() { return nodes_.run(static_cast<T>(s_.clock->dt), touched_); }
+  NodePass<T>& given() { return nodes_; }
+  FlipPass<T>* flip() { return flip_.get(); }
+  Counts from_nodes() {
+    if (flip_) return flip_->from_nodes(homes_, laws_);
+    return fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_);
+  }
+
+ private:
+  const SolverView<T>& s_;
+  const int laws_;
+  std::vector<uint8_t>& touched_;
+  ContactPlan<T> contact_;
+  SurfacePlan<T> surface_;
+  TouchPlan<T> touch_;
+  HomePass<T> homes_;
+  NodePass<T> nodes_;
+  std::unique_ptr<FieldPass<T>> fields_;
+  std::unique_ptr<FlipPass<T>> flip_;
+};
+
+// All ranks, phase by phase.
+template <typename T>
+class Lockstep {
+ public:
+  Lockstep(const SolverView<T>& s, int laws)
+      : s_(s), cut_(s), sums_(cut_.halos()), flip_sums_(cut_.halos()) {
+    for (Rank<T>& rank : cut_.ranks())
+      ranks_.push_back(std::make_unique<Stepper<T>>(rank, laws, cut_.several()));
+  }
+
+  // Again after each build.
+  void plan() {
+    const SolverClock& c = *s_.clock;
+    STD_TORCH_CHECK(c.homes >= 0 && c.homes <= s_.home_capacity && c.slots >= 0 &&
+                        c.slots <= s_.slot_capacity && c.sites >= 0 && c.sites <= c.slots,
+                    "solver: the clock counts more blocks than there is room for");
+    cut_.make();
+    for (auto& rank : ranks_) rank->plan();
+    if (!cut_.several()) return;
+    const auto each = [&](const auto& f) {
+      std::vector<std::invoke_result_t<decltype(f), size_t>> of_rank;
+      for (size_t r = 0; r < ranks_.size(); ++r) of_rank.push_back(f(r));
+      return of_rank;
+    };
+    std::vector<Rank<T>>& own = cut_.ranks();
+    constexpr int64_t kReal = sizeof(T);
+    sums_.plan(each([&](size_t r) { return own[r].touched.data(); }));
+    sums_.share(kTouchedSums, 4 * sizeof(double), each([&](size_t r) { return own[r].view.sums; }));
+    sums_.share(kTouchedMoments, kContactMoments * kReal,
+                each([&](size_t r) { return own[r].view.moments; }));
+    sums_.share(kTouchedPush, 4 * kReal,
+                each([&](size_t r) { return static_cast<void*>(ranks_[r]->pushes()); }));
+    if (s_.own == nullptr) return;
+    flip_sums_.plan(each([&](size_t r) { return ranks_[r]->flip()->touched(); }));
+    flip_sums_.share(kTouchedSums, 4 * sizeof(double),
+                     each([&](size_t r) { return static_cast<void*>(ranks_[r]->flip()->sums()); }));
+  }
+
   void step() {
     SolverClock& c = *s_.clock;
-    Counts all = homes_.to_nodes(touched_);
-    nodes_.run(static_cast<T>(c.dt), touched_);
-    if (flip_)
-      all.add(flip_->from_nodes(homes_, laws_));
-    else
-      all.add(fields_ ? fields_->from_nodes(homes_) : homes_.from_nodes(laws_));
+    cut_.begin();
+    for (auto& rank : ranks_) rank->begin();
+    Counts all = to_nodes(sums_, [](Stepper<T>& rank, int color) { return rank.to_nodes(color); });
+    for (auto& rank : ranks_) c.touched += rank->nodes();
+    end_colliders();
+    if (s_.own != nullptr)
+      all.add(to_nodes(flip_sums_,
+                       [](Stepper<T>& rank, int color) { return rank.flip()->to_nodes(color); }));
+    for (auto& rank : ranks_) all.add(rank->from_nodes());
     c.plastic += all.plastic;
     c.guarded += all.guarded;
     c.inverted += all.inverted;
@@ -68,16 +130,28 @@ class Stepper {
   }
 
  private:
+  // f(rank, colour) of all ranks, which agree on their sums in between.
+  template <typename F>
+  Counts to_nodes(Agreement& sums, const F& f) {
+    Counts all;
+    sums.begin();
+    for (int color = 0; color < kColors; ++color) {
+      for (auto& rank : ranks_) all.add(f(*rank, color));
+      sums.agree();
+    }
+    return all;
+  }
+  void end_colliders() {
+    if (!cut_.several()) return ranks_[0]->given().end_colliders();
+    std::vector<Given> given;
+    for (auto& rank : ranks_) rank->given().give(given);
+    cut_.end_colliders(given);
+  }
+
   const SolverView<T>& s_;
-  const int laws_;
-  ContactPlan<T> contact_;
-  SurfacePlan<T> surface_;
-  TouchPlan<T> touch_;
-  HomePass<T> homes_;
-  NodePass<T> nodes_;
-  std::unique_ptr<FieldPass<T>> fields_;
-  std::unique_ptr<FlipPass<T>> flip_;
-  std::vector<uint8_t> touched_;  // [slots] Touched bits of this step
+  RankCut<T> cut_;
+  Agreement sums_, flip_sums_;
+  std::vector<std::unique_ptr<Stepper<T>>> ranks_;
 };
 
 template <typename T>
@@ -104,6 +178,7 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
 
 struct Cpu {
   using Scope = CpuScope;
+  static constexpr bool kRanks = true;
 
   template <typename T>
   static void prime(const SolverView<T>& s, int laws, const Scope&) {
@@ -116,19 +191,35 @@ struct Cpu {
     choose_unit(c);
   }
 
+  // Points, homes, slots of each rank, and slots that others hold too; since the last build.
+  template <typename T>
+  static void ranks(const SolverView<T>& s, int64_t* out) {
+    RankCut<T> cut(s);
+    cut.make();
+    const std::vector<Rank<T>>& of = cut.ranks();
+    for (size_t r = 0; r < of.size(); ++r) {
+      const SolverClock& c = *of[r].view.clock;
+      const int64_t row[] = {of[r].view.count, c.homes, c.slots, 0};
+      std::copy_n(row, 4, out + 4 * r);
+    }
+    for (const Halos::Holder& holder : cut.halos().holders) ++out[4 * holder.rank + 3];
+  }
+
   template <typename T>
   static void run(const SolverView<T>& s, int laws, int64_t rounds, int64_t steps, const Scope&) {
     SolverClock& c = *s.clock;
     if (s.row_count == 0) return;
-    Stepper<T> stepper(s, laws);
-    if (may_step(c)) stepper.plan();
+    STD_TORCH_CHECK(s.ranks == 1 || (laws != kDamageField && s.object == nullptr),
+                    "solver: several ranks know no phase field and no objects");
+    Lockstep<T> ranks(s, laws);
+    if (may_step(c)) ranks.plan();
     for (int64_t i = 0; i < rounds * steps; ++i) {
       if (may_build(c)) {
         solver_build(s);
-        if (may_step(c)) stepper.plan();
+        if (may_step(c)) ranks.plan();
       }
       if (!may_step(c)) return;
-      stepper.step();
+      ranks.step();
     }
   }
 };

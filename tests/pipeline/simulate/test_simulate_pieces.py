@@ -258,3 +258,23 @@ def test_pieces_are_looked_for_as_often_as_anything_moves(monkeypatch: pytest.Mo
     assert len(looks) > 5 and run.state.step > 100 * len(looks)
     for (before, _), (now, fastest) in itertools.pairwise(looks):
         assert fastest * (now - before) >= 0.25 * DX
+
+
+def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ends, used = [], set()
+    counted = ops.Solver.counters
+    monkeypatch.setattr(
+        ops.Solver, "counters", lambda solver: used.add(solver.ranks) or counted(solver)
+    )
+    for ranks in (1, 3):
+        monkeypatch.setitem(ops.Solver.__init__.__kwdefaults__, "ranks", ranks)
+        *_, last = Simulate(dx=DX, splats=False)(dropped(), fps=20, seconds=0.75)
+        ends.append(last)
+    one, several = ends
+    assert used == {1, 3} and one.stats["pieces"] > 1 and one.stats["broken_fraction"] > 0.1
+    for name in ("position", "velocity", "strain", "alpha"):
+        assert torch.equal(getattr(several.particles, name), getattr(one.particles, name)), name
+    assert torch.equal(several.fragments, one.fragments)
+    assert several.stats == one.stats

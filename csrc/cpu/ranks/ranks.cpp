@@ -1,0 +1,262 @@
+// See cpu/ranks/ranks.h. A file of its own, so that the loops of one rank stay as they are
+// compiled.
+#include "cpu/ranks/ranks.h"
+
+#include <cstring>
+
+namespace gsf::cpu {
+namespace {
+
+constexpr int64_t kHaloGrain = 16;
+enum Held : uint8_t { kHeld = 1, kNeeded = 2 };
+
+// Row `first` of an array with so many columns that may be absent.
+template <typename W>
+W* row_at(W* array, int64_t first, int columns = 1) {
+  return array != nullptr ? array + first * columns : nullptr;
+}
+
+}  // namespace
+
+void Agreement::share(Touched mark, int64_t bytes, const std::vector<void*>& of_rank) {
+  if (std::all_of(of_rank.begin(), of_rank.end(), [](void* p) { return p == nullptr; })) return;
+  Array& array = arrays_.emplace_back();
+  array.mark = mark;
+  array.words = kBlockNodes * bytes / int64_t(sizeof(uint64_t));
+  for (void* p : of_rank) array.of_rank.push_back(static_cast<unsigned char*>(p));
+  array.agreed.resize(halos_.count() * array.words);
+}
+
+void Agreement::begin() {
+  for (Array& array : arrays_) std::fill(array.agreed.begin(), array.agreed.end(), 0);
+}
+
+void Agreement::agree() {
+  parallel_for(halos_.count(), kHaloGrain, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) {
+      uint8_t marks = 0;
+      for (int64_t at = halos_.first[i]; at < halos_.first[i + 1]; ++at)
+        marks |= touched_[halos_.holders[at].rank][halos_.holders[at].slot];
+      for (int64_t at = halos_.first[i]; at < halos_.first[i + 1]; ++at)
+        touched_[halos_.holders[at].rank][halos_.holders[at].slot] = marks;
+      for (Array& array : arrays_)
+        if (marks & array.mark) agree(array, i);
+    }
+  });
+}
+
+void Agreement::agree(Array& array, int64_t halo) const {
+  uint64_t* agreed = array.agreed.data() + halo * array.words;
+  const auto holder = halos_.holders.begin();
+  const auto copy = [&](int64_t at) {
+    return array.of_rank[holder[at].rank] + holder[at].slot * array.words * sizeof(uint64_t);
+  };
+  const int64_t first = halos_.first[halo], end = halos_.first[halo + 1];
+  for (int64_t i = 0; i < array.words; ++i) {
+    uint64_t changed = 0, bits;
+    for (int64_t at = first; at < end; ++at) {
+      std::memcpy(&bits, copy(at) + i * sizeof bits, sizeof bits);
+      changed ^= bits ^ agreed[i];
+    }
+    if (changed == 0) continue;
+    agreed[i] ^= changed;
+    for (int64_t at = first; at < end; ++at)
+      std::memcpy(copy(at) + i * sizeof bits, agreed + i, sizeof bits);
+  }
+}
+
+template <typename T>
+void RankCut<T>::make() {
+  const SolverClock& c = *s_.clock;
+  if (!several()) {
+    ranks_[0].touched.assign(c.slots, 0);
+    return;
+  }
+  slot_key_.resize(c.slots);
+  for (int64_t i = 0; i < c.slots; ++i) {
+    const int32_t* b = s_.slot_coord + 4 * i;
+    slot_key_[i] = block_key(b[0], b[1], b[2], b[3]);
+  }
+  answered_.assign(c.sites, 0);
+  share_homes();
+  for (Rank<T>& rank : ranks_) {
+    find_held(rank);
+    fill(rank);
+  }
+  find_halos();
+}
+
+// Stretches of homes with about as many points each.
+template <typename T>
+void RankCut<T>::share_homes() {
+  const HomeList<T>& list = s_.homes();
+  const int64_t homes = s_.clock->homes, ranks = static_cast<int64_t>(ranks_.size());
+  const auto first_of = [&](int64_t r) {
+    return std::lower_bound(list.start, list.start + homes, r * s_.count / ranks) - list.start;
+  };
+  for (int64_t r = 0; r < ranks; ++r) {
+    ranks_[r].first_home = r == 0 ? 0 : first_of(r);
+    ranks_[r].homes = (r + 1 == ranks ? homes : first_of(r + 1)) - ranks_[r].first_home;
+  }
+}
+
+template <typename T>
+bool RankCut<T>::needed(const int32_t* slots) const {
+  return std::any_of(slots, slots + kSiteFields,
+                     [&](int32_t i) { return slot(i) >= 0 && held_[slot(i)] == kNeeded; });
+}
+
+// Slots under the windows of a rank's homes, which it needs. Where fields may meet it also holds
+// what its share of contact hangs on, whoever needs it: every field at the sites of what it needs,
+// the nodes around those that fields share, and whether a block next to its homes is shared.
+template <typename T>
+void RankCut<T>::find_held(const Rank<T>& rank) {
+  held_.assign(s_.clock->slots, 0);
+  const auto hold = [&](int64_t i) { held_[i] = std::max<uint8_t>(held_[i], kHeld); };
+  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+    for (int n = 0; n < kNeighbours; ++n) {
+      const int32_t below = slot(s_.neighbour[kNeighbours * h + n]);
+      if (below >= 0) held_[below] = kNeeded;
+    }
+  if (s_.fields == 1) return;
+  const auto around = [&](const int32_t* b, const auto& f) {
+    for (int n = 0; n < kNeighbours; ++n) {
+      const uint64_t key =
+          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+      const auto at = std::lower_bound(slot_key_.begin(), slot_key_.end(), key);
+      if (at != slot_key_.end() && *at == key) f(at - slot_key_.begin());
+    }
+  };
+  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+    around(s_.homes().coord + 4 * h, [&](int64_t i) {
+      if (s_.slot_shared[i] != 0) hold(i);
+    });
+  for (int64_t i = 0; i < s_.clock->sites; ++i) {
+    const int32_t* slots = s_.site_slots + kSiteFields * i;
+    if (!needed(slots)) continue;
+    for (int f = 0; f < kSiteFields; ++f) {
+      const int32_t here = slot(slots[f]);
+      if (here < 0) continue;
+      hold(here);
+      if (s_.slot_shared[here] != 0) around(s_.slot_coord + 4 * int64_t(here), hold);
+    }
+  }
+}
+
+// The rank's own lists of what find_held found, and its view.
+template <typename T>
+void RankCut<T>::fill(Rank<T>& rank) {
+  const HomeList<T>& list = s_.homes();
+  const int64_t home = rank.first_home, end = home + rank.homes;
+  const auto start_of = [&](int64_t h) {
+    return h < s_.clock->homes ? std::clamp<int64_t>(list.start[h], 0, s_.count) : s_.count;
+  };
+  const int64_t first = start_of(home), last = std::max(first, start_of(end));
+
+  std::vector<int32_t> number(s_.clock->slots, -1);
+  rank.slots.clear();
+  rank.slot_coord.clear();
+  rank.slot_shared.clear();
+  for (int64_t i = 0; i < s_.clock->slots; ++i) {
+    if (held_[i] == 0) continue;
+    number[i] = static_cast<int32_t>(rank.slots.size());
+    rank.slots.push_back(i);
+    rank.slot_coord.insert(rank.slot_coord.end(), s_.slot_coord + 4 * i, s_.slot_coord + 4 * i + 4);
+    rank.slot_shared.push_back(s_.slot_shared[i]);
+  }
+  const auto own = [&](int32_t of_all) { return slot(of_all) >= 0 ? number[of_all] : -1; };
+  rank.sites = {};
+  rank.site_slots.clear();
+  for (int64_t i = 0; i < s_.clock->sites; ++i) {
+    const int32_t* slots = s_.site_slots + kSiteFields * i;
+    if (!needed(slots)) continue;
+    rank.sites.number.push_back(i);
+    rank.sites.answers.push_back(answered_[i] == 0 ? 1 : 0);
+    answered_[i] = 1;
+    for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
+  }
+  rank.home_start.resize(rank.homes);
+  rank.neighbour.resize(kNeighbours * rank.homes);
+  for (int64_t h = 0; h < rank.homes; ++h)
+    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - first);
+  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i)
+    rank.neighbour[i] = own(s_.neighbour[kNeighbours * home + i]);
+  const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
+  rank.touched.assign(rank.slots.size(), 0);
+  rank.sums.assign(4 * nodes, 0.0);
+  rank.moments.assign(s_.moments != nullptr ? kContactMoments * nodes : 0, T(0));
+  rank.node_velocity.assign(4 * nodes, T(0));
+
+  SolverView<T>& v = rank.view;
+  v = s_;
+  v.count = last - first;
+  v.home_capacity = rank.homes;
+  v.slot_capacity = static_cast<int64_t>(rank.slots.size());
+  v.clock = &rank.clock;
+  v.offset = row_at(s_.offset, first, 3);
+  v.meta = row_at(s_.meta, first);
+  v.velocity = row_at(s_.velocity, first, 3);
+  v.slope = row_at(s_.slope, first, 9);
+  v.strain = row_at(s_.strain, first, 6);
+  v.alpha = row_at(s_.alpha, first);
+  v.peak = row_at(s_.peak, first);
+  v.deformation = row_at(s_.deformation, first, 9);
+  v.viscous = row_at(s_.viscous, first, kViscousColumns);
+  v.own = row_at(s_.own, first, 9);
+  v.id = row_at(s_.id, first);
+  v.entry = row_at(s_.entry, first);
+  v.home[0] = v.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
+  v.neighbour = rank.neighbour.data();
+  v.slot_coord = rank.slot_coord.data();
+  v.slot_shared = rank.slot_shared.data();
+  v.site_slots = rank.site_slots.data();
+  v.sums = rank.sums.data();
+  v.moments = rank.moments.empty() ? nullptr : rank.moments.data();
+  v.node_velocity = rank.node_velocity.data();
+  rank.tell(*s_.clock);
+}
+
+template <typename T>
+void RankCut<T>::find_halos() {
+  std::vector<std::vector<Halos::Holder>> holders(s_.clock->slots);
+  for (size_t r = 0; r < ranks_.size(); ++r)
+    for (size_t i = 0; i < ranks_[r].slots.size(); ++i)
+      holders[ranks_[r].slots[i]].push_back({static_cast<int32_t>(r), static_cast<int32_t>(i)});
+  halos_.first.assign(1, 0);
+  halos_.holders.clear();
+  for (const std::vector<Halos::Holder>& of_slot : holders) {
+    if (of_slot.size() < 2) continue;
+    halos_.holders.insert(halos_.holders.end(), of_slot.begin(), of_slot.end());
+    halos_.first.push_back(static_cast<int64_t>(halos_.holders.size()));
+  }
+}
+
+template <typename T>
+void RankCut<T>::begin() {
+  if (!several()) return;
+  for (Rank<T>& rank : ranks_) rank.tell(*s_.clock);
+}
+
+template <typename T>
+void RankCut<T>::end_colliders(std::vector<Given>& given) const {
+  std::stable_sort(given.begin(), given.end(),
+                   [](const Given& a, const Given& b) { return a.site < b.site; });
+  std::vector<double> sums(s_.collider_count * kImpulseSums, 0.0), chunk(sums.size(), 0.0);
+  const auto close = [&] {
+    for (size_t i = 0; i < sums.size(); ++i) sums[i] += chunk[i];
+    std::fill(chunk.begin(), chunk.end(), 0.0);
+  };
+  for (size_t i = 0; i < given.size(); ++i) {
+    if (i > 0 && given[i].site / kSiteChunk != given[i - 1].site / kSiteChunk) close();
+    for (int n = 0; n < kImpulseSums; ++n)
+      chunk[given[i].collider * kImpulseSums + n] += given[i].sums[n];
+  }
+  close();
+  for (int64_t k = 0; k < s_.collider_count; ++k)
+    end_collider(s_, k, sums.data() + k * kImpulseSums, s_.clock->dt);
+}
+
+template class RankCut<float>;
+template class RankCut<double>;
+
+}  // namespace gsf::cpu

@@ -1,0 +1,219 @@
+"""Ranks in lockstep: the bits of one, whatever is cut where."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from solver_scenes import DX, bullet, scene
+from test_solver_cpu import STATE, broken, mixed_rows, shuffled, small
+
+from gsfluent import ops
+from gsfluent.errors import InputError
+from gsfluent.lab.world.shapes import parameters
+from gsfluent.ops.plasticity import PHASE_CODES
+
+DTYPES = [torch.float32, torch.float64]
+STEPS = 40
+
+
+def free(dtype: torch.dtype) -> dict[str, Any]:
+    return small("tracked", dtype) | {"colliders": None}
+
+
+def of_law(law: int, row: torch.Tensor) -> Any:
+    """One body above the floor, of a law whose kernel is compiled apart."""
+
+    def given(dtype: torch.dtype) -> dict[str, Any]:
+        table = row.to(dtype).reshape(1, 8).clone()
+        table[:, 6] = 1000.0
+        kind = torch.tensor([law], dtype=torch.int32)
+        return small("elastic", dtype) | {"law": kind, "params": table}
+
+    return given
+
+
+def relaxing(dtype: torch.dtype) -> dict[str, Any]:
+    given = small("two bodies", dtype)
+    row = torch.tensor([0.0] * 6 + [0.4, 0.002, 0.0], dtype=dtype)
+    return given | {"viscous": row.expand(given["mass"].shape[0], 9).contiguous()}
+
+
+def kept(dtype: torch.dtype) -> dict[str, Any]:
+    return small("all", dtype) | {"cfl": 0.25, "flip": 0.5}
+
+
+def pushed(dtype: torch.dtype) -> dict[str, Any]:
+    given = small("two bodies", dtype)
+    return given | {"radius": torch.full_like(given["mass"], 0.25 * DX)}
+
+
+def shot(dtype: torch.dtype) -> dict[str, Any]:
+    """A ball with a mass of its own flies in: where it goes hangs on every impulse it gets."""
+    given = small("two bodies", dtype)
+    return given | {"colliders": bullet(given["position"], dtype)}
+
+
+def side_by_side(dtype: torch.dtype) -> dict[str, Any]:
+    """Two bodies that fly at each other along x, the axis of the cuts: with two ranks, one each."""
+    given = small("two bodies", dtype)
+    speed = torch.where(given["body"] == 0, 3.0, -3.0).to(dtype)
+    turned = given["velocity"][:, [1, 0, 0]].clone()
+    turned[:, 0] = speed
+    return given | {
+        "position": given["position"][:, [2, 1, 0]].contiguous(), "velocity": turned,
+        "colliders": None, "frame": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+
+
+def cut_by_a_blade(dtype: torch.dtype) -> dict[str, Any]:
+    """Four fields of two bodies: those of one move as one, but for two that a blade parts."""
+    given = small("two bodies", dtype)
+    half = (given["position"][:, 0] > given["position"][:, 0].mean()).int()
+    ints = {"parent": [0, 0, 1, 1], "cut": [1, 2, 0, 0]}
+    return given | {
+        "body": 2 * given["body"] + half,
+        **{name: torch.tensor(rows, dtype=torch.int32) for name, rows in ints.items()},
+    }
+
+
+CASES = {
+    "free": free,
+    "nacc": lambda dtype: small("nacc", dtype),
+    "metal": of_law(3, parameters(1e5, 0.3, 1.0, c2=20.0, c4=0.01)),
+    "metal with a rate": of_law(3, parameters(1e5, 0.3, 1.0, c2=20.0, c4=0.01, c7=0.5, c3=0.02)),
+    "relaxing": relaxing,
+    "two bodies": lambda dtype: small("all", dtype),
+    "mixed": mixed_rows,
+    "broken": broken,
+    "flip": kept,
+    "radius": pushed,
+    "bullet": shot,
+    "side by side": side_by_side,
+    "blade": cut_by_a_blade,
+}
+
+
+def run(given: dict[str, Any], ranks: int, steps: int = STEPS, **options: Any) -> ops.Solver:
+    solver = ops.Solver(**given, ranks=ranks, **options)
+    solver.advance(steps=steps)
+    return solver
+
+
+def assert_equal(have: ops.Solver, want: ops.Solver) -> None:
+    for name in STATE:
+        value = getattr(want, name)
+        if value is not None:
+            assert torch.equal(getattr(have, name), value), name
+    assert torch.equal(have.impulse, want.impulse)
+    assert torch.equal(have.colliders, want.colliders)
+    assert have.clock() == want.clock()
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("name", CASES)
+def test_bits_do_not_hang_on_the_cut(name: str, dtype: torch.dtype) -> None:
+    given = CASES[name](dtype)
+    one = run(given, 1)
+    assert (one.counters()["contact_nodes"] > 0) == (int(given["body"].max()) > 0)
+    for ranks in (2, 3, 8):
+        several = run(given, ranks)
+        assert_equal(several, one)
+        parts = several.rank_counts()
+        assert sum(part["points"] > 0 for part in parts) > 1
+        assert sum(part["shared"] for part in parts) > 0
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_any_number_of_ranks_gives_the_bits_of_one_through_many_builds(dtype: torch.dtype) -> None:
+    given = small("all", dtype)
+    one = run(given, 1, 120)
+    assert one.counters()["builds"] >= 10
+    for ranks in (*range(2, 9), 64):
+        several = run(given, ranks, 120)
+        assert_equal(several, one)
+        parts = several.rank_counts()
+        assert len(parts) == ranks
+        assert sum(part["points"] for part in parts) == one.count
+        assert sum(part["homes"] for part in parts) == one.counters()["homes"]
+        assert max(part["points"] for part in parts) < one.count
+    empty = [part for part in parts if part["points"] == 0]
+    assert empty and all(part["slots"] == 0 for part in empty)
+
+
+def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
+    given = side_by_side(torch.float32)
+    two = run(given, 2)
+    half = two.count // 2
+    # but for points that share a block with the other body
+    assert all(abs(part["points"] - half) < 8 for part in two.rank_counts())
+    assert two.counters()["contact_nodes"] > 0
+
+
+def test_a_build_cuts_anew() -> None:
+    given = small("two bodies", torch.float32)
+    solver = run(given, 3, 1)
+    before = solver.rank_counts()
+    solver.advance(steps=80)
+    assert solver.rank_counts() != before
+
+
+def test_order_of_points_and_threads_leave_no_trace() -> None:
+    given = scene(cells=8, bodies=2, laws=(0, 1), dtype=torch.float32)
+    mixed, order = shuffled(given)
+    one = run(given, 1, 20)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        several = run(mixed, 5, 20)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(several.position, one.position[order])
+    assert torch.equal(several.impulse, one.impulse)
+
+
+def test_room_for_blocks_grows_and_going_back_leave_no_trace() -> None:
+    given = small("two bodies", torch.float32)
+    one = run(given, 1)
+    tight = ops.Solver(**given, ranks=3)
+    tight._buffers.reserve_blocks(int(tight.clock()["homes"]), 1, 2)
+    start = tight.snapshot()
+    for _ in range(2):
+        tight.advance(steps=STEPS)
+        assert torch.equal(tight.position, one.position)
+        assert torch.equal(tight.velocity, one.velocity)
+        tight.restore(start)
+
+
+def test_the_same_failure_at_the_same_step() -> None:
+    given = small("two bodies", torch.float32)
+    told = []
+    for ranks in (1, 4):
+        with pytest.raises(ops.SolverError) as failure:
+            run(given, ranks, dt=6e-3)
+        told.append(str(failure.value))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("ranks", [0, -1, 65, 2.0, True, "2"])
+def test_a_number_of_ranks_that_is_none_is_refused(ranks: Any) -> None:
+    with pytest.raises(InputError, match="ranks must be a whole number of 1 to 64"):
+        ops.Solver(**small("elastic"), ranks=ranks)
+
+
+def test_what_ranks_do_not_know_is_refused_by_name() -> None:
+    given = pushed(torch.float32)
+    two = torch.tensor([0, 1], dtype=torch.int32)
+    with pytest.raises(InputError, match="2 ranks do not know objects yet"):
+        ops.Solver(**given, objects=two, ranks=2)
+    row = parameters(1e5, 0.3, 1.0, c2=1.0, c3=0.04, c4=0.02, c5=PHASE_CODES[0])
+    given = of_law(9, row)(torch.float32)
+    with pytest.raises(InputError, match=r"2 ranks do not know law phase_field \(9\) yet"):
+        ops.Solver(**given, ranks=2)
+    ops.Solver(**given, ranks=1)
+
+
+def test_nothing_is_cut_before_a_step() -> None:
+    with pytest.raises(InputError, match="before a step"):
+        ops.Solver(**small("elastic"), ranks=2).rank_counts()
