@@ -23,7 +23,6 @@ from torch.nn.functional import normalize
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.geometry import quaternion_to_matrix
-from gsfluent.pipeline.light.normals import plate_normals
 
 FACE_ON = 0.02
 """Share that is reflected straight on, by an index of 1.33."""
@@ -91,20 +90,18 @@ def body_opacities(splats: Gaussians, clear: Clear, eye: Tensor) -> Tensor:
     return 1.0 - torch.exp(-clear.attenuation.to(shadow) * thick)
 
 
-def surface_normals(splats: Gaussians, eye: Tensor) -> Tensor:
-    """Unit normals [M, 3] of the splats of a liquid, toward the ``eye`` [3].
+def surface_normals(splats: Gaussians, axes: Tensor, eye: Tensor) -> Tensor:
+    """Normals [M, 3] of the splats of a liquid: their shortest ``axes`` [M, 3], toward the eye [3].
 
     The shortest axis of a ball is any: what is round, a drop, faces the eye.
     """
     least, most = splats.scales.amin(dim=1), splats.scales.amax(dim=1)
     ball = ((least / most - ROUND) / (1.0 - ROUND)).clamp(0.0, 1.0)
-    return torch.lerp(
-        plate_normals(splats, eye), normalize(eye - splats.means, dim=1), ball[:, None]
-    )
+    return torch.lerp(axes, normalize(eye - splats.means, dim=1), ball[:, None])
 
 
 def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
-    """The surface with normals and depths that are smooth over a spacing [m], but not across its edges."""
+    """The surface, normals and depths smooth over a few spacings [m] but not across its edges."""
     there = surface.alpha > 0.05
     if not bool(there.any()):
         return surface

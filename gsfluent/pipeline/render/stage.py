@@ -315,7 +315,8 @@ def _wetted(
     paint[rows] = torch.cat([mine.colors(), torch.ones_like(mine.means[:, :1])], dim=1).to(paint)
     body = draw_at(gaussians, *view, size, colors=paint, near=_NEAR, groups=groups).image
     front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
-    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=surface_normals(front, eye))
+    normals = surface_normals(front, plate_normals(front, eye), eye)
+    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=normals)
     assert seen.depth is not None and seen.normal is not None  # asked for
     surface = smoothed(Surface(seen.alpha, seen.depth, seen.normal), spacing, camera)
     cover = covered(surface, spacing, camera)

@@ -150,7 +150,8 @@ def test_drops_face_the_eye() -> None:
     eye = torch.tensor([0.0, 0.0, 2.0])
     means, colors = torch.zeros(2, 3), torch.ones(2, 3)
     scales = torch.tensor([[1e-3, 1e-3, 1e-3], [4e-3, 1e-3, 4e-3]])
-    found = surface_normals(Gaussians.from_colors(means, scales, colors, opacities=0.9), eye)
+    axes = torch.tensor([[0.0, 1.0, 0.0]] * 2)
+    found = surface_normals(Gaussians.from_colors(means, scales, colors, opacities=0.9), axes, eye)
     torch.testing.assert_close(found[0], torch.tensor([0.0, 0.0, 1.0]))
     assert found[1].abs().tolist() == [0.0, 1.0, 0.0]
 
