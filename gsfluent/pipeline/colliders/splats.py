@@ -19,7 +19,7 @@ _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
 _PAINT = {
     "water": (0.50, 0.62, 0.66),
-    "milk": (0.84, 0.825, 0.775),
+    "milk": (0.88, 0.865, 0.81),
     "honey": (0.75, 0.45, 0.08),
     "oil": (0.70, 0.60, 0.15),
 }
