@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -176,29 +175,29 @@ def transmission_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
 
 
 def clear_of(frame: SavedFrame) -> Clear | None:
-    """The splats of clear liquids; None where there are none.
+    """The splats of liquids; None where there are none.
 
     A liquid lets through as much of the light on every centimetre as its ``transmission`` says.
     """
-    found = []
-    for _, preset in frame.facts.get("bodies", ()):
-        made = materials.get(preset) if preset in materials.names() else None
-        flows = made is not None and made.law == "fluid" and made.transmission > 0.0
-        found.append(-math.log(made.transmission) / 0.01 if made is not None and flows else 0.0)
-    if not any(found):
+    bodies = [
+        materials.get(preset) if preset in materials.names() else None
+        for _, preset in frame.facts.get("bodies", ())
+    ]
+    liquids = [made for made in bodies if made is not None and made.law == "fluid"]
+    if not liquids:
         return None
     like = frame.gaussians.means
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
-    each = like.new_tensor(found)[body]
+    flows = torch.tensor([made in liquids for made in bodies], device=like.device)
+    clarity = like.new_tensor([1.0 if made is None else made.transmission for made in bodies])
     # those of solids have numbers up from 0, those of the repair too
-    rows = (anchor >= 0) & (frame.ids < 0) & (each > 0.0)
-    gloss = [materials.get(p) for (_, p), a in zip(frame.facts["bodies"], found, strict=True) if a]
+    rows = (anchor >= 0) & (frame.ids < 0) & flows[body]
     return Clear(
         rows=rows,
         volume=frame.volumes[anchor[rows]],
-        attenuation=each[rows],
-        gloss=like.new_tensor([gloss[0].specular, gloss[0].shininess]),
+        attenuation=-100.0 * clarity.log()[body[rows]],
+        gloss=like.new_tensor([liquids[0].specular, liquids[0].shininess]),
     )
 
 

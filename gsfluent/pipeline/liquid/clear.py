@@ -1,13 +1,13 @@
-"""Clear liquids in a picture: a body that takes a little of the light, and a surface that reflects.
+"""Liquids in a picture: a body that takes light, a little or all, and a surface that reflects.
 
 Splats blend one colour and one normal in a pixel. Where one looks through water at a stone, there
-are two surfaces, so a clear liquid is drawn apart from what is behind it:
+are two surfaces, so a liquid is drawn apart from what is behind it:
 
 * its **body** takes ``1 - exp(-a t)`` of the light behind it, ``t`` the way through it (Beer and
   Lambert): each splat has the opacity of its own thickness, so that blending multiplies them;
 * its **surface** is that of the same splats when they are opaque. Their normals are smoothed over
   the spacing of the points, across the picture and not across edges (van der Laan, Green and Sainz
-  2009 smooth depths so); it reflects by Schlick (1994) with the index of water.
+  2009 smooth depths so), and so are depths; it reflects by Schlick (1994) with the index of water.
 
 No ray is bent.
 """
@@ -28,8 +28,14 @@ FACE_ON = 0.02
 """Share that is reflected straight on, by an index of 1.33."""
 OPACITY = 0.97
 """Of a splat of the surface."""
-SMOOTH = 0.8
-"""Standard deviation of the smoothing of normals, in spacings of the points."""
+SMOOTH = 2.0
+"""Standard deviation of the smoothing, in spacings of the points: a cell of the grid."""
+EDGE = (0.25, 0.75)
+"""Opacity of the splats at which the edge of a liquid begins, and where it is all there."""
+FINE = 2.0
+"""Distance of the points from which on edges are sharpened, entirely at twice as much [px]."""
+ROUND = 0.7
+"""Shortest over longest axis from which on a splat is a ball, more and more."""
 STEP = 2.0
 """What lies so many spacings deeper is another surface."""
 MOST_PIXELS = 12
@@ -41,12 +47,12 @@ CEILING = (0.25, 0.85)
 
 
 class Clear(NamedTuple):
-    """Splats of clear liquids in a scene.
+    """Splats of liquids in a scene, clear or not.
 
     Attributes:
         rows: Which splats they are, bool [N].
         volume: Volume of the matter of each of them [m^3], [M] (M of ``rows``).
-        attenuation: Of the light in their liquid [1/m], [M].
+        attenuation: Of the light in their liquid [1/m], inf for what is opaque, [M].
         gloss: k_s and n_s of Blinn-Phong, [2].
     """
 
@@ -80,12 +86,22 @@ def body_opacities(splats: Gaussians, clear: Clear, eye: Tensor) -> Tensor:
     way = normalize(splats.means - eye, dim=1)
     along = (turn.mT @ way[..., None])[..., 0] / splats.scales
     shadow = 2.0 * math.pi * splats.scales.prod(dim=1) * along.norm(dim=1)
-    thick = clear.volume.to(shadow) / shadow.clamp(min=1e-30)
+    thick = (clear.volume.to(shadow) / shadow.clamp(min=1e-30)).clamp(min=1e-12)
     return 1.0 - torch.exp(-clear.attenuation.to(shadow) * thick)
 
 
+def surface_normals(splats: Gaussians, axes: Tensor, eye: Tensor) -> Tensor:
+    """Normals [M, 3] of the splats of a liquid: their shortest ``axes`` [M, 3], toward the eye [3].
+
+    The shortest axis of a ball is any: what is round, a drop, faces the eye.
+    """
+    least, most = splats.scales.amin(dim=1), splats.scales.amax(dim=1)
+    ball = ((least / most - ROUND) / (1.0 - ROUND)).clamp(0.0, 1.0)
+    return torch.lerp(axes, normalize(eye - splats.means, dim=1), ball[:, None])
+
+
 def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
-    """The surface with normals that are smooth over a spacing [m], but not across its edges."""
+    """The surface, normals and depths smooth over a few spacings [m] but not across its edges."""
     there = surface.alpha > 0.05
     if not bool(there.any()):
         return surface
@@ -93,14 +109,39 @@ def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
     middle = float(depth[there].median())
     sigma = min(SMOOTH * spacing * float(camera.K[0, 0]) / middle, MOST_PIXELS)
     reach = math.ceil(2.5 * sigma)
-    values = torch.cat([normalize(surface.normal, dim=2), depth[..., None]], dim=2)
-    weight = surface.alpha * there
+    rows, columns = (_span(there.any(dim=dim)) for dim in (1, 0))
+    values = torch.cat([normalize(surface.normal, dim=2), depth[..., None]], dim=2)[rows, columns]
+    weight = (surface.alpha * there)[rows, columns]
     for dim in (0, 1):
         # a window has no more than the picture
-        values, weight = _blurred(values, weight, sigma, min(reach, depth.shape[dim] - 1), dim,
+        values, weight = _blurred(values, weight, sigma, min(reach, weight.shape[dim] - 1), dim,
                                   STEP * spacing)  # fmt: skip
-    normal = normalize(values[..., :3], dim=2)
-    return Surface(surface.alpha, surface.depth, torch.where(there[..., None], normal, 0.0))
+    made = torch.cat([torch.zeros_like(surface.normal), surface.depth[..., None]], dim=2)
+    there = there[rows, columns][..., None]
+    values = torch.cat([normalize(values[..., :3], dim=2), values[..., 3:]], dim=2)
+    made[rows, columns] = torch.where(there, values, made[rows, columns])
+    return Surface(surface.alpha, made[..., 3], made[..., :3])
+
+
+def _span(there: Tensor) -> slice:
+    """From the first to the last of what is there."""
+    found = there.nonzero()
+    return slice(int(found[0]), int(found[-1]) + 1)
+
+
+def covered(surface: Surface, spacing: float, camera: Camera) -> Tensor:
+    """Opacity [H, W] of a surface with the edge of a liquid, which is sharp.
+
+    A level of the splats' field is the surface (Zhu and Bridson 2005): what half covers a pixel is
+    its edge. Where points are hardly farther apart than pixels, there is nothing to be gained and
+    drops would flicker: there their opacity stays.
+    """
+    pixels = spacing * float(camera.K[0, 0]) / surface.depth.clamp(min=1e-6)
+    share = ((pixels - FINE) / FINE).clamp(0.0, 1.0)
+    low, high = EDGE
+    inside = ((surface.alpha - low) / (high - low)).clamp(0.0, 1.0)
+    sharp = inside * inside * (3.0 - 2.0 * inside)
+    return torch.lerp(surface.alpha, sharp, share)
 
 
 def _blurred(
@@ -109,7 +150,9 @@ def _blurred(
     """Values [H, W, 4] blurred along a dimension with those of a like depth, their last."""
     total, many = torch.zeros_like(values), torch.zeros_like(weight)
     length = weight.shape[dim]
-    for k in range(-reach, reach + 1):
+    # a wide bell is told by some of its places
+    stride = max(1, int(sigma / 2.5))
+    for k in range(-(reach // stride) * stride, reach + 1, stride):
         count = length - abs(k)
         here, there = max(0, -k), max(0, k)
         own, other = values.narrow(dim, here, count), values.narrow(dim, there, count)

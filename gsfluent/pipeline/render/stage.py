@@ -31,9 +31,11 @@ from gsfluent.pipeline.liquid.clear import (
     Surface,
     body_opacities,
     ceiling,
+    covered,
     in_front,
     mirrored,
     smoothed,
+    surface_normals,
 )
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.studio import Studio
@@ -151,7 +153,7 @@ class Render(Stage):
             time: Moment [s], for lamps that move.
             room: ``room`` of the picture before in a film, so that the grid behind normals and
                 occlusion stays what it was while the matter fits.
-            clear: The splats that are a clear liquid: drawn as its body and its surface, the same
+            clear: The splats that are a liquid: drawn as its body and its surface, the same
                 in ``alpha`` as if they were opaque. None draws them as all others.
 
         Raises:
@@ -162,9 +164,11 @@ class Render(Stage):
         view = (_moved(camera.viewmat, means), _moved(camera.K, means))
         eye = -(view[0][:3, 3] @ view[0][:3, :3])
         lighting = None if self.light is None else self.light.at(time)
-        everything = (gaussians, groups)
+        everything, dense = (gaussians, groups), gaussians
         if clear is not None and bool(clear.rows.any()) and not bool(clear.rows.all()):
             everything = (_as_body(gaussians, clear, eye), groups)
+            through = clear.rows.masked_scatter(clear.rows, clear.attenuation.isfinite())
+            dense = gaussians.select((~through).nonzero()[:, 0])
             rest = (~clear.rows).nonzero()[:, 0]
             gaussians = gaussians.select(rest)
             groups, gloss, plates = (
@@ -174,7 +178,7 @@ class Render(Stage):
             clear = None
         lit, extras = None, None
         if lighting is not None:
-            lit, room = self._light(gaussians, camera, lighting, everything, room)
+            lit, room = self._light(dense, camera, lighting, everything, room)
             extras = splat_normals(gaussians, lit.grid, eye)
             if plates is not None:
                 extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
@@ -274,7 +278,7 @@ class Render(Stage):
 
 
 def _as_body(gaussians: Gaussians, clear: Clear, eye: Tensor) -> Gaussians:
-    """The splats, those of clear liquids as transparent as their bodies are."""
+    """The splats, those of liquids as transparent as their bodies are."""
     rows = clear.rows.nonzero()[:, 0]
     body = body_opacities(gaussians.select(rows), clear, eye)
     return gaussians.replace(
@@ -290,7 +294,7 @@ def _wetted(
     view: tuple[Tensor, Tensor],
     lit: Lit | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Picture, opacity and depth with clear liquids before what is behind them.
+    """Picture, opacity and depth with liquids before what is behind them.
 
     Args:
         behind: The picture of all else, its opacity and depth.
@@ -311,35 +315,43 @@ def _wetted(
     paint[rows] = torch.cat([mine.colors(), torch.ones_like(mine.means[:, :1])], dim=1).to(paint)
     body = draw_at(gaussians, *view, size, colors=paint, near=_NEAR, groups=groups).image
     front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
-    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=plate_normals(front, eye))
+    normals = surface_normals(front, plate_normals(front, eye), eye)
+    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=normals)
     assert seen.depth is not None and seen.normal is not None  # asked for
     surface = smoothed(Surface(seen.alpha, seen.depth, seen.normal), spacing, camera)
-    there = in_front(surface, alpha, depth, spacing)
+    cover = covered(surface, spacing, camera)
+    there = in_front(surface._replace(alpha=cover), alpha, depth, spacing)
+    # the body ends where the surface does
+    scale = torch.minimum(cover / seen.alpha.clamp(min=1e-6), 1.0 / body[..., 3].clamp(min=1e-6))
+    body = body * scale[..., None]
     taken, color = body[..., 3], body[..., :3]
     if lit is not None:
+        # nothing hides the surroundings of what lets light through: no matter stands on a liquid
+        opaque = bool(clear.attenuation.isinf().any())
         none = torch.zeros_like(image[0, 0])
         planes = (color, taken, surface.depth, surface.normal)
         dull = _constant((0.0, 1.0), image.dtype, image.device)
-        color = _shaded(planes, dull, view, _open(lit), none, None)
+        color = _shaded(planes, dull, view, lit if opaque else _open(lit), none, None)
     shown = to_linear(image * (1.0 - taken[..., None]) + color)
     if lit is not None:
-        planes = (torch.zeros_like(image), torch.ones_like(alpha), surface.depth, surface.normal)
+        anywhere = (there > 0.0).to(alpha)
+        planes = (torch.zeros_like(image), anywhere, surface.depth, surface.normal)
         shine = _shaded(planes, clear.gloss.to(image), view, _open(lit), none, None)
         _, rays = surface_points(surface.depth, *view)
         share, toward = mirrored(surface.normal, rays)
         mirror = ceiling(toward)[..., None] + irradiance(lit.environment, toward)
         share = (share * there)[..., None]
         shown = shown * (1.0 - share) + share * mirror + there[..., None] * to_linear(shine)
-    nearer = (seen.alpha > 0.5) & ((surface.depth < depth) | (alpha < 0.5))
+    nearer = (cover > 0.5) & ((surface.depth < depth) | (alpha < 0.5))
     return (
         to_display(shown).clamp(0.0, 1.0),
-        1.0 - (1.0 - alpha) * (1.0 - seen.alpha),
+        1.0 - (1.0 - alpha) * (1.0 - cover),
         torch.where(nearer, surface.depth, depth),
     )
 
 
 def _open(lit: Lit) -> Lit:
-    """The light where nothing hides the surroundings: no matter stands on a liquid."""
+    """The light where nothing hides the surroundings."""
     return replace(lit, occlusion=0.0)
 
 

@@ -25,6 +25,7 @@ from gsfluent.pipeline.light.bake import bake_light
 from gsfluent.pipeline.light.from_shot import (
     DROPS,
     changed,
+    clear_of,
     gloss_of,
     light_of,
     plates_of,
@@ -433,6 +434,21 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     assert plates_of(loose).nonzero()[:, 0].tolist() == [3, 5]
     loose.facts = {}
     assert gloss_of(shot(tmp_path), loose) is None
+
+
+def test_every_liquid_is_drawn_as_one_and_solids_are_not(skin: Gaussians) -> None:
+    """Milk, too: drawn by single splats its pool had the normals of single points."""
+    seen = frame(skin, skin)
+    assert clear_of(seen) is None
+    seen.facts = {"bodies": [["melon", "fruit.watermelon"], ["pour", "milk"], ["pool", "water"]]}
+    seen.volumes = torch.linspace(1e-9, 2e-9, skin.count)
+    seen.body[5:9], seen.body[9:11] = 1, 2
+    seen.ids[5:11] = -seen.ids[5:11]
+    found = clear_of(seen)
+    assert found is not None and found.rows.nonzero()[:, 0].tolist() == [*range(5, 11)]
+    assert found.attenuation[:4].isinf().all()
+    torch.testing.assert_close(found.attenuation[4:], torch.full((2,), -100.0 * math.log(0.75)))
+    assert torch.equal(found.volume, seen.volumes[5:11])
 
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0, 75.0, 88.0])

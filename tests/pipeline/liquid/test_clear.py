@@ -1,4 +1,5 @@
-"""Clear liquids: how much light goes through, what reflects, and that a gap in them is a hole."""
+"""Liquids in a picture: how much light goes through, what reflects, how smooth and sharp they are,
+and that a gap in them is a hole."""
 
 from __future__ import annotations
 
@@ -10,7 +11,15 @@ from torch import Tensor
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.pipeline.light.lamps import studio_light
-from gsfluent.pipeline.liquid.clear import Clear, Surface, in_front, mirrored, smoothed
+from gsfluent.pipeline.liquid.clear import (
+    Clear,
+    Surface,
+    covered,
+    in_front,
+    mirrored,
+    smoothed,
+    surface_normals,
+)
 from gsfluent.pipeline.liquid.sheet import ellipsoids
 from gsfluent.pipeline.render.holes import Holes, MatterView
 from gsfluent.pipeline.render.stage import Picture, Render
@@ -46,11 +55,17 @@ def stone(below: float) -> Gaussians:
     return Gaussians.from_colors(means, torch.full((len(means),), 0.0015), red, opacities=0.98)
 
 
-def drawn(water: Gaussians, *behind: Gaussians, lit: bool = False, clear: bool = True) -> Picture:
+def drawn(
+    water: Gaussians,
+    *behind: Gaussians,
+    lit: bool = False,
+    clear: bool = True,
+    attenuation: float = LETS,
+) -> Picture:
     whole = Gaussians.cat([water, *behind])
     rows = torch.arange(whole.count) < water.count
     volume = torch.full((water.count,), H**3)
-    told = Clear(rows, volume, torch.full_like(volume, LETS), torch.tensor([0.9, 200.0]))
+    told = Clear(rows, volume, torch.full_like(volume, attenuation), torch.tensor([0.9, 200.0]))
     stage = Render(camera(), studio_light() if lit else None)
     return stage(whole, clear=told if clear else None)
 
@@ -94,6 +109,53 @@ def test_a_wet_surface_glints_and_what_is_before_it_hides_it() -> None:
     assert float((hidden - alone)[inside, inside].abs().mean()) < 0.02
 
 
+def test_an_opaque_liquid_hides_what_is_behind_it_and_is_smooth() -> None:
+    """Rough points of milk are no rough milk: its light is even, blended by splats it is not."""
+    _, milk = pool(0.012)
+    lift = torch.randn(milk.count, generator=torch.Generator().manual_seed(2))
+    milk = milk.replace(means=milk.means + 1e-3 * lift[:, None] * milk.means.new_tensor([0, 0, 1]))
+    under = [
+        drawn(milk, stone(0.03), attenuation=math.inf).image,
+        drawn(milk, stone(0.3), attenuation=math.inf).image,
+    ]
+    inside = slice(60, 100)
+    assert float((under[0] - under[1])[inside, inside].abs().max()) < 2e-3
+    even, rough = (
+        drawn(milk, stone(0.03), lit=True, clear=clear, attenuation=math.inf).image[inside, inside]
+        for clear in (True, False)
+    )
+    assert float(even.std(dim=(0, 1)).max()) < 0.3 * float(rough.std(dim=(0, 1)).max())
+
+
+def test_edges_of_a_liquid_are_sharp_where_its_points_are_seen_apart() -> None:
+    alpha = torch.tensor([[0.1, 0.25, 0.5, 0.75, 0.9, 0.97]])
+    normal = torch.zeros(1, 6, 3)
+    near = covered(Surface(alpha, torch.full_like(alpha, 2.0), normal), H, camera())
+    assert near[0].tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0, 1.0])
+    far = covered(Surface(alpha, torch.full_like(alpha, 20.0), normal), H, camera())
+    torch.testing.assert_close(far, alpha)
+
+
+def test_a_thin_spot_of_a_film_is_no_dark_pit() -> None:
+    """What is seen through a gap between splats lies deeper, and would be in their shadow."""
+    alpha, depth = torch.ones(80, 80), torch.full((80, 80), 2.0)
+    alpha[40, 40], depth[40, 40] = 0.6, 2.0 + 1.5 * H
+    normal = torch.tensor([0.0, 0.0, 1.0]).expand(80, 80, 3)
+    made = smoothed(Surface(alpha, depth, normal), H, camera())
+    assert float((made.depth - 2.0).abs().max()) < 0.1 * H
+
+
+def test_drops_face_the_eye() -> None:
+    """The shortest axis of a ball is any: a drop was lit from wherever it pointed."""
+    eye = torch.tensor([0.0, 0.0, 2.0])
+    means, colors = torch.zeros(2, 3), torch.ones(2, 3)
+    scales = torch.tensor([[1e-3, 1e-3, 1e-3], [4e-3, 1e-3, 4e-3]])
+    axes = torch.tensor([[0.0, 1.0, 0.0]] * 2)
+    found = surface_normals(Gaussians.from_colors(means, scales, colors, opacities=0.9), axes, eye)
+    torch.testing.assert_close(found[0], torch.tensor([0.0, 0.0, 1.0]))
+    assert found[1].abs().tolist() == [0.0, 1.0, 0.0]
+
+
 def test_nothing_clear_leaves_the_picture_as_it_was() -> None:
     rest = stone(0.0)
     none = Clear(torch.zeros(rest.count, dtype=torch.bool), *(torch.zeros(0),) * 2, torch.ones(2))
@@ -134,14 +196,16 @@ def test_schlick_and_what_stands_before() -> None:
 
 
 @pytest.mark.cuda
-def test_the_same_water_on_a_gpu() -> None:
+@pytest.mark.parametrize("attenuation", [LETS, math.inf])
+def test_the_same_liquid_on_a_gpu(attenuation: float) -> None:
     _, water = pool(0.012)
     whole = Gaussians.cat([water, stone(0.03)])
     found = []
     for device in ("cpu", "cuda"):
         rows = (torch.arange(whole.count) < water.count).to(device)
         volume = torch.full((water.count,), H**3, device=device)
-        told = Clear(rows, volume, torch.full_like(volume, LETS), volume.new_tensor([0.9, 200.0]))
+        lets, gloss = torch.full_like(volume, attenuation), volume.new_tensor([0.9, 200.0])
+        told = Clear(rows, volume, lets, gloss)
         stage = Render(camera(), studio_light())
         made = stage(whole.to(device), clear=told)
         found.append((made.image.cpu(), made.alpha.cpu()))
