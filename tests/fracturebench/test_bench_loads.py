@@ -7,10 +7,10 @@ import pytest
 import torch
 from loaded_scripts import load_script
 
-from gsfluent.fracturebench.registry import find
+from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.shapes import box, elastic, free, plane
-from gsfluent.lab.frozen.answer import rows, run_case
+from gsfluent.lab.frozen.answer import rows, run_case, viscosity
 from gsfluent.lab.world.driver import World
 from gsfluent.pipeline.matter.brittle import softened
 
@@ -128,10 +128,31 @@ def test_an_unknown_table_is_named(capsys: pytest.CaptureFixture[str]) -> None:
 def test_pressed_rock_says_what_a_strength_without_a_rate_can_reach() -> None:
     text = "\n".join(loads.strengths(quick=True))
     assert "| experiment | 448 MPa | 296 MPa | 1.51 | 1.29 to 1.74 |" in text
-    ours = next(line for line in text.splitlines() if line.startswith("| gsfluent"))
+    ours = next(line for line in text.splitlines() if line.startswith("| without"))
     fast, slow = (float(cell.split()[0]) for cell in ours.split("|")[2:4])
     least, most = (float(word.strip(",;")) for word in
                    text.split("static strength times ")[1].split(";")[0].split(" to "))  # fmt: skip
     for factor, inside in ((least + 0.01, True), (most - 0.01, True), (least - 0.02, False)):
         within = abs(factor * fast / 448.0 - 1) < 0.25 and abs(factor * slow / 295.8 - 1) < 0.25
         assert within == inside
+
+
+def test_a_row_that_yields_late_makes_its_points_viscous() -> None:
+    scene = find("rock_press").build(find("rock_press").ladder[0], 8)
+    found = viscosity(scene)
+    assert found is not None and found.shape == (scene.count, 9)
+    rock = torch.from_numpy(scene.body) == 0
+    assert (found[rock, 8] == 6e-6).all() and not found[~rock].any() and not found[:, :8].any()
+    assert viscosity(scene, "phase_field") is None and viscosity(cube()) is None
+
+
+def test_strength_of_pressed_rock_rises_with_the_rate_because_of_its_row() -> None:
+    case = find("rock_press")
+    scene = case.build(case.ladder[0], 8)
+    late, at_once = (
+        [m.value for m in judge(scene, run_case(scene, **options))]
+        for options in ({}, {"viscous": None})
+    )
+    assert at_once[2] < 1.2 and late[2] > 1.5
+    # a yield that takes time only adds, and the more the faster
+    assert 1.0 < late[1] / at_once[1] < late[0] / at_once[0]

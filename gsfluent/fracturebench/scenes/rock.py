@@ -27,6 +27,9 @@ EXPERIMENT = Path(__file__).parents[1] / "data" / "rock.json"
 SMALLEST = 12
 """Points of the smallest piece that has a shape."""
 _SIZE, _RATES = 0.035, (180.0, 50.0)
+_YIELD_TIME = 6e-6
+"""Time of a yield of quartzite [s], to two digits that which meets the fast test on the frozen
+grid. A crack at the speed of Rayleigh waves takes 7.5e-6 s from the middle to the side."""
 _SOURCE = "Rae et al., sandstone, quartzite, limestone"
 
 
@@ -123,14 +126,15 @@ def rock_press(dx: float, per_cell: int) -> Scene:
     """Two cylinders of quartzite pressed at 180 and 50 1/s: strength, and its rise with the rate.
 
     Each is 35 mm long and thick, between heavy plates that move at constant speed and hold nothing
-    sideways. Strength is calibrated to the slow test (255 MPa), toughness to K_Ic; the strength of
-    the rock scatters by a fifth over a quarter of its size.
+    sideways. Strength is calibrated to the slow test (255 MPa), toughness to K_Ic, the time that a
+    yield takes to the strength at 180 1/s: what is predicted is that at 50 1/s, and the rise. The
+    strength of the rock scatters by a fifth over a quarter of its size.
     """
     young, nu, density = 38.1e9, 0.099, 2645.0
     row = brittle(
         young, nu, density, friction=2.4, cohesion=0.02, strength=0.0161, softening=0.0012,
         energy=0.0317, dx=dx, reference=_SIZE / 10.0,
-    )  # fmt: skip
+    ) | {"yield_time": _YIELD_TIME}  # fmt: skip
     plate = elastic(30.0 * young, nu, 30.0 * density)
     half = 0.5 * _SIZE
     rock = box([-half] * 3, [_SIZE] * 3, dx, per_cell)

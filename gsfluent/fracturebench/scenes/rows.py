@@ -11,6 +11,9 @@ most 0.495 kappa.
 ``hardening``      xi
 ``alpha``          log plastic volume ratio at the start; negative is intact. Plastic volume raises
                    it, and at 0 the strength is gone: damage is ``1 - max(alpha) / alpha(0)``
+``yield_time``     where there is one, the time T [s] that a yield takes (Duvaut and Lions 1976): a
+                   state x beyond the surface falls to its return x' by ``-(x - x') / T``, so that
+                   strength grows with the rate; without one at once
 ================== =================================================================================
 
 For another damage model the same rows say what to calibrate to:

@@ -77,6 +77,21 @@ def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, t
     return torch.tensor(laws, dtype=torch.int32), torch.stack(params), start
 
 
+def viscosity(scene: Scene, law: str = "nacc") -> torch.Tensor | None:
+    """Viscosity of each point, float64 [N, 9], where a row yields late; None where none does.
+
+    Args:
+        scene: The scene.
+        law: Of what breaks; ``phase_field`` has no yield.
+    """
+    time = [float(m.get("yield_time", 0.0)) for m in scene.materials]
+    if law != "nacc" or not any(time):
+        return None
+    found = torch.zeros((scene.count, 9), dtype=torch.float64)
+    found[:, 8] = torch.tensor(time, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
+    return found
+
+
 def _colliders(scene: Scene) -> torch.Tensor | None:
     made = [
         collider_row(
@@ -168,7 +183,7 @@ def run_case(
         friction=scene.friction, cfl=cfl, dt=dt, dtype=dtype, device=device, engine=engine,
         force=drives,
         deformation=bool(options.pop("deformation", False)) or "deformation" in scene.asks,
-        **options,
+        **({"viscous": viscosity(scene, law)} | options),
     )  # fmt: skip
     if setup is not None:
         setup(world)
