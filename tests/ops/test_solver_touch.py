@@ -40,7 +40,7 @@ def test_balls_bounce_and_make_neither_energy_nor_momentum(
         kept, most, drift = touching.head_on(5.0, cfl=cfl)
     assert least < kept < 1.0  # the transfer's loss is one of each step
     assert most <= 1.0 + 1e-6
-    assert drift < 1e-6
+    assert drift < (1e-6 if device == "cpu" else 1e-5)  # sums of 32-bit numbers there
 
 
 def test_nodes_that_exchange_impulses_keep_less() -> None:
