@@ -14,6 +14,7 @@ from gsfluent.lab.problems.contact.contact import SPACING, bodies
 from gsfluent.lab.world.driver import World, running_on
 from gsfluent.lab.world.registry import Result
 from gsfluent.lab.world.shapes import box
+from gsfluent.lab.world.walls import wall
 from gsfluent.ops.reference import touch
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -39,7 +40,7 @@ def test_balls_bounce_and_make_neither_energy_nor_momentum(
         kept, most, drift = touching.head_on(5.0, cfl=cfl)
     assert least < kept < 1.0  # the transfer's loss is one of each step
     assert most <= 1.0 + 1e-6
-    assert drift < 1e-6
+    assert drift < (1e-6 if device == "cpu" else 1e-5)  # sums of 32-bit numbers there
 
 
 def test_nodes_that_exchange_impulses_keep_less() -> None:
@@ -54,7 +55,10 @@ def test_sliding_is_coulombs(friction: float, device: str) -> None:
 
 
 def _pressed(
-    device: str, dtype: torch.dtype = torch.float64, turn: torch.Tensor | None = None
+    device: str,
+    dtype: torch.dtype = torch.float64,
+    turn: torch.Tensor | None = None,
+    **options: Any,
 ) -> World:
     """Two rough cubes that overlap by a fifth of a cell and move into each other."""
     generator = torch.Generator().manual_seed(2)
@@ -64,7 +68,7 @@ def _pressed(
         parts = [p[turn] for p in parts]
     speed = torch.tensor([0.01, 0.02, 0.04], dtype=torch.float64)
     given: dict[str, Any] = dict(dtype=dtype, surface=0.5, touch=True, friction=0.3, device=device)
-    return bodies(parts, [speed, -speed], **given)
+    return bodies(parts, [speed, -speed], **given, **options)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -118,10 +122,15 @@ def test_momentum_and_angular_momentum_are_exchanged_only(device: str) -> None:
 
 @pytest.mark.cuda
 def test_a_gpu_does_what_a_cpu_does() -> None:
-    here, there = _pressed("cuda").run(steps=40), _pressed("cpu").run(steps=40)
+    """Rough bodies that overlap, rub, stand on a floor that pushes them and keep their motion."""
+    floors = [wall(2, 0.2, mode="separate", friction=0.3)]
+    given = dict(dt=0.3, flip=0.4, colliders=floors, gravity=(0.0, 0.0, -0.002))
+    here, there = (_pressed(place, **given).run(steps=40) for place in ("cuda", "cpu"))
+    assert float(there.impulse[0, 2]) > 0.0
     for part in ("position", "velocity", "affine", "strain"):
         a, b = getattr(here, part).cpu(), getattr(there, part)
         assert float((a - b).abs().max()) < 1e-9, part
+    assert float((here.impulse.cpu() - there.impulse).abs().max()) < 1e-6
 
 
 @pytest.mark.parametrize("device", DEVICES)
