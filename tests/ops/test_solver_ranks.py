@@ -78,6 +78,21 @@ def cut_by_a_blade(dtype: torch.dtype) -> dict[str, Any]:
     }
 
 
+def dust(dtype: torch.dtype, seed: int = 0) -> dict[str, Any]:
+    """Points of three bodies anywhere, so that homes hold few, reach little and drift apart."""
+    given = small("elastic", dtype)
+    n = 300
+    generator = torch.Generator().manual_seed(seed)
+    lot = torch.rand(n, 7, generator=generator, dtype=torch.float64)
+    return {name: value[:n] if isinstance(value, torch.Tensor) and value.shape[0] > n else value
+            for name, value in given.items()} | {
+        "position": lot[:, :3] * torch.tensor([20 * DX, 10 * DX, 6 * DX], dtype=torch.float64),
+        "velocity": (4.0 * (lot[:, 3:6] - 0.5)).to(dtype),
+        "body": (3.0 * lot[:, 6]).int(),
+        "colliders": None, "frame": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+
+
 CASES = {
     "free": free,
     "nacc": lambda dtype: small("nacc", dtype),
@@ -140,6 +155,19 @@ def test_any_number_of_ranks_gives_the_bits_of_one_through_many_builds(dtype: to
         assert max(part["points"] for part in parts) < one.count
     empty = [part for part in parts if part["points"] == 0]
     assert empty and all(part["slots"] == 0 for part in empty)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_sparse_points_that_drift_keep_the_bits(seed: int) -> None:
+    """What a home reaches is its own affair; which fields meet where is everybody's."""
+    given = dust(torch.float32, seed)
+    if seed % 2 == 1:  # two of the three move as one
+        given["parent"] = torch.tensor([0, 0, 1], dtype=torch.int32)
+        given["cut"] = torch.zeros(3, dtype=torch.int32)
+    one = run(given, 1, 60)
+    assert one.counters()["contact_nodes"] > 0
+    for ranks in (2, 5, 8):
+        assert_equal(run(given, ranks, 60), one)
 
 
 def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
