@@ -10,12 +10,6 @@ namespace {
 constexpr int64_t kHaloGrain = 16;
 enum Held : uint8_t { kHeld = 1, kNeeded = 2 };
 
-// Row `first` of an array with so many columns that may be absent.
-template <typename W>
-W* row_at(W* array, int64_t first, int columns = 1) {
-  return array != nullptr ? array + first * columns : nullptr;
-}
-
 }  // namespace
 
 void Agreement::share(Touched mark, int64_t bytes, const std::vector<void*>& of_rank) {
@@ -62,6 +56,39 @@ void Agreement::agree(Array& array, int64_t halo) const {
     agreed[i] ^= changed;
     for (int64_t at = first; at < end; ++at)
       std::memcpy(copy(at) + i * sizeof bits, agreed + i, sizeof bits);
+  }
+}
+
+template <typename T>
+RankCut<T>::RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
+  if (!several()) {
+    ranks_[0].view = s;
+    return;
+  }
+  const HomeList<T>& list = s.homes();
+  int64_t held = 0;
+  bool sound = s.clock->homes >= 0 && s.clock->homes <= s.home_capacity;
+  for (int64_t h = 0; sound && h < s.clock->homes; ++h) {
+    sound = list.start[h] == held && list.count[h] >= 0 && list.count[h] <= s.count - held;
+    held += list.count[h];
+  }
+  STD_TORCH_CHECK(sound && held == s.count,
+                  "solver: several ranks need the points in the order of their homes");
+  share_homes();
+  for (Rank<T>& rank : ranks_) {
+    const int64_t first = start_of(rank.first_home), end = start_of(rank.first_home + rank.homes);
+    rank.points = RankPoints<T>(s, end - first);
+    own_homes(rank);
+    copy_points(s, first, end - first, rank.view, 0);
+  }
+}
+
+template <typename T>
+void RankCut<T>::gather() const {
+  int64_t at = 0;
+  for (const Rank<T>& rank : ranks_) {
+    if (several()) copy_points(rank.view, 0, rank.points.count, s_, at);
+    at += rank.points.count;
   }
 }
 
@@ -143,16 +170,27 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
   }
 }
 
+// The rank's view of its points and homes.
+template <typename T>
+void RankCut<T>::own_homes(Rank<T>& rank) {
+  const HomeList<T>& list = s_.homes();
+  const int64_t home = rank.first_home;
+  rank.home_start.resize(rank.homes);
+  for (int64_t h = 0; h < rank.homes; ++h)
+    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - start_of(home));
+  rank.view = s_;
+  rank.points.show(rank.view);
+  rank.view.clock = &rank.clock;
+  rank.view.home_capacity = rank.homes;
+  rank.view.home[0] =
+      rank.view.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
+  rank.tell(*s_.clock);
+}
+
 // The rank's own lists of what find_held found, and its view.
 template <typename T>
 void RankCut<T>::fill(Rank<T>& rank) {
-  const HomeList<T>& list = s_.homes();
-  const int64_t home = rank.first_home, end = home + rank.homes;
-  const auto start_of = [&](int64_t h) {
-    return h < s_.clock->homes ? std::clamp<int64_t>(list.start[h], 0, s_.count) : s_.count;
-  };
-  const int64_t first = start_of(home), last = std::max(first, start_of(end));
-
+  own_homes(rank);
   std::vector<int32_t> number(s_.clock->slots, -1);
   rank.slots.clear();
   rank.slot_coord.clear();
@@ -175,12 +213,9 @@ void RankCut<T>::fill(Rank<T>& rank) {
     answered_[i] = 1;
     for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
   }
-  rank.home_start.resize(rank.homes);
   rank.neighbour.resize(kNeighbours * rank.homes);
-  for (int64_t h = 0; h < rank.homes; ++h)
-    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - first);
   for (int64_t i = 0; i < kNeighbours * rank.homes; ++i)
-    rank.neighbour[i] = own(s_.neighbour[kNeighbours * home + i]);
+    rank.neighbour[i] = own(s_.neighbour[kNeighbours * rank.first_home + i]);
   const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
   rank.touched.assign(rank.slots.size(), 0);
   rank.sums.assign(4 * nodes, 0.0);
@@ -188,24 +223,7 @@ void RankCut<T>::fill(Rank<T>& rank) {
   rank.node_velocity.assign(4 * nodes, T(0));
 
   SolverView<T>& v = rank.view;
-  v = s_;
-  v.count = last - first;
-  v.home_capacity = rank.homes;
   v.slot_capacity = static_cast<int64_t>(rank.slots.size());
-  v.clock = &rank.clock;
-  v.offset = row_at(s_.offset, first, 3);
-  v.meta = row_at(s_.meta, first);
-  v.velocity = row_at(s_.velocity, first, 3);
-  v.slope = row_at(s_.slope, first, 9);
-  v.strain = row_at(s_.strain, first, 6);
-  v.alpha = row_at(s_.alpha, first);
-  v.peak = row_at(s_.peak, first);
-  v.deformation = row_at(s_.deformation, first, 9);
-  v.viscous = row_at(s_.viscous, first, kViscousColumns);
-  v.own = row_at(s_.own, first, 9);
-  v.id = row_at(s_.id, first);
-  v.entry = row_at(s_.entry, first);
-  v.home[0] = v.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
   v.neighbour = rank.neighbour.data();
   v.slot_coord = rank.slot_coord.data();
   v.slot_shared = rank.slot_shared.data();
