@@ -179,6 +179,22 @@ def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
     assert two.counters()["contact_nodes"] > 0
 
 
+def test_the_cut_is_across_the_longest_axis() -> None:
+    """A column shares the same few blocks whichever way it stands."""
+    given = small("elastic", torch.float32) | {"colliders": None, "gravity": (0.0, 0.0, 0.0)}
+    step = 5 * DX * torch.arange(6, dtype=torch.float64)[:, None, None]
+    for name in ("velocity", "mass", "volume", "alpha", "material", "strain", "body"):
+        given[name] = given[name].repeat(6, *[1] * (given[name].dim() - 1))
+    shared = []
+    for axis in range(3):
+        away = step * torch.eye(3, dtype=torch.float64)[axis]
+        column = (given["position"] + away).reshape(-1, 3)
+        two = run(given | {"position": column}, 2, 1)
+        shared.append(two.rank_counts()[0]["shared"])
+        assert shared[-1] < 0.35 * two.counters()["slots"]
+    assert max(shared) < 1.5 * min(shared)
+
+
 def test_a_build_cuts_anew() -> None:
     given = small("two bodies", torch.float32)
     solver = run(given, 3, 1)

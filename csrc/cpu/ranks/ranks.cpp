@@ -76,20 +76,22 @@ RankCut<T>::RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
                   "solver: several ranks need the points in the order of their homes");
   share_homes();
   for (Rank<T>& rank : ranks_) {
-    const int64_t first = start_of(rank.first_home), end = start_of(rank.first_home + rank.homes);
-    rank.points = RankPoints<T>(s, end - first);
+    int64_t count = 0;
+    for (const int64_t h : rank.homes) count += list.count[h];
+    rank.points = RankPoints<T>(s, count);
     own_homes(rank);
-    copy_points(s, first, end - first, rank.view, 0);
+    for (size_t i = 0; i < rank.homes.size(); ++i)
+      copy_points(s, list.start[rank.homes[i]], rank.home_count[i], rank.view, rank.home_start[i]);
   }
 }
 
 template <typename T>
 void RankCut<T>::gather() const {
-  int64_t at = 0;
-  for (const Rank<T>& rank : ranks_) {
-    if (several()) copy_points(rank.view, 0, rank.points.count, s_, at);
-    at += rank.points.count;
-  }
+  if (!several()) return;
+  for (const Rank<T>& rank : ranks_)
+    for (size_t i = 0; i < rank.homes.size(); ++i)
+      copy_points(rank.view, rank.home_start[i], rank.home_count[i], s_,
+                  s_.homes().start[rank.homes[i]]);
 }
 
 template <typename T>
@@ -113,18 +115,37 @@ void RankCut<T>::make() {
   find_halos();
 }
 
-// Stretches of homes with about as many points each.
+// Cuts across the longest axis, with about as many points on each side as there are ranks to come.
 template <typename T>
 void RankCut<T>::share_homes() {
   const HomeList<T>& list = s_.homes();
   const int64_t homes = s_.clock->homes, ranks = static_cast<int64_t>(ranks_.size());
-  const auto first_of = [&](int64_t r) {
-    return std::lower_bound(list.start, list.start + homes, r * s_.count / ranks) - list.start;
-  };
-  for (int64_t r = 0; r < ranks; ++r) {
-    ranks_[r].first_home = r == 0 ? 0 : first_of(r);
-    ranks_[r].homes = (r + 1 == ranks ? homes : first_of(r + 1)) - ranks_[r].first_home;
+  int axis = 0;
+  int32_t longest = -1;
+  for (int a = 0; a < 3; ++a) {
+    int32_t low = kBlockRange, high = -kBlockRange;
+    for (int64_t h = 0; h < homes; ++h) {
+      low = std::min(low, list.coord[4 * h + a]);
+      high = std::max(high, list.coord[4 * h + a]);
+    }
+    if (high - low > longest) {
+      longest = high - low;
+      axis = a;
+    }
   }
+  std::vector<int64_t> along(homes);
+  std::iota(along.begin(), along.end(), 0);
+  std::stable_sort(along.begin(), along.end(), [&](int64_t a, int64_t b) {
+    return list.coord[4 * a + axis] < list.coord[4 * b + axis];
+  });
+  for (Rank<T>& rank : ranks_) rank.homes.clear();
+  int64_t r = 0, before = 0;
+  for (const int64_t h : along) {
+    while (r + 1 < ranks && before >= (r + 1) * s_.count / ranks) ++r;
+    ranks_[r].homes.push_back(h);
+    before += list.count[h];
+  }
+  for (Rank<T>& rank : ranks_) std::sort(rank.homes.begin(), rank.homes.end());
 }
 
 template <typename T>
@@ -140,7 +161,7 @@ template <typename T>
 void RankCut<T>::find_held(const Rank<T>& rank) {
   held_.assign(s_.clock->slots, 0);
   const auto hold = [&](int64_t i) { held_[i] = std::max<uint8_t>(held_[i], kHeld); };
-  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+  for (const int64_t h : rank.homes)
     for (int n = 0; n < kNeighbours; ++n) {
       const int32_t below = slot(s_.neighbour[kNeighbours * h + n]);
       if (below >= 0) held_[below] = kNeeded;
@@ -154,7 +175,7 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
       if (at != slot_key_.end() && *at == key) f(at - slot_key_.begin());
     }
   };
-  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+  for (const int64_t h : rank.homes)
     around(s_.homes().coord + 4 * h, [&](int64_t i) {
       if (s_.slot_shared[i] != 0) hold(i);
     });
@@ -174,16 +195,22 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
 template <typename T>
 void RankCut<T>::own_homes(Rank<T>& rank) {
   const HomeList<T>& list = s_.homes();
-  const int64_t home = rank.first_home;
-  rank.home_start.resize(rank.homes);
-  for (int64_t h = 0; h < rank.homes; ++h)
-    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - start_of(home));
+  rank.home_coord.clear();
+  rank.home_start.clear();
+  rank.home_count.clear();
+  int32_t at = 0;
+  for (const int64_t h : rank.homes) {
+    rank.home_coord.insert(rank.home_coord.end(), list.coord + 4 * h, list.coord + 4 * h + 4);
+    rank.home_start.push_back(at);
+    rank.home_count.push_back(list.count[h]);
+    at += list.count[h];
+  }
   rank.view = s_;
   rank.points.show(rank.view);
   rank.view.clock = &rank.clock;
-  rank.view.home_capacity = rank.homes;
+  rank.view.home_capacity = static_cast<int64_t>(rank.homes.size());
   rank.view.home[0] =
-      rank.view.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
+      rank.view.home[1] = {rank.home_coord.data(), rank.home_start.data(), rank.home_count.data()};
   rank.tell(*s_.clock);
 }
 
@@ -213,9 +240,10 @@ void RankCut<T>::fill(Rank<T>& rank) {
     answered_[i] = 1;
     for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
   }
-  rank.neighbour.resize(kNeighbours * rank.homes);
-  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i)
-    rank.neighbour[i] = own(s_.neighbour[kNeighbours * rank.first_home + i]);
+  rank.neighbour.clear();
+  for (const int64_t h : rank.homes)
+    for (int n = 0; n < kNeighbours; ++n)
+      rank.neighbour.push_back(own(s_.neighbour[kNeighbours * h + n]));
   const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
   rank.touched.assign(rank.slots.size(), 0);
   rank.sums.assign(4 * nodes, 0.0);

@@ -74,18 +74,19 @@ struct Rank {
   std::vector<uint8_t> touched;  // [slots] Touched bits of this step
   // Of one rank of several; the only one holds what the view of all does.
   SolverClock clock;
-  int64_t first_home = 0, homes = 0;
+  std::vector<int64_t> homes;  // numbers among those of all, ascending
   RankPoints<T> points;
   RankSites sites;
   std::vector<int64_t> slots;  // [slots] numbers among those of all, ascending
-  std::vector<int32_t> home_start, neighbour, slot_coord, slot_shared, site_slots;
+  std::vector<int32_t> home_coord, home_start, home_count, neighbour, slot_coord, slot_shared,
+      site_slots;
   std::vector<double> sums;
   std::vector<T> moments, node_velocity;
 
   // The clock of all, with the rank's own blocks.
   void tell(const SolverClock& all) {
     clock = all;
-    clock.homes = homes;
+    clock.homes = static_cast<int64_t>(homes.size());
     clock.slots = static_cast<int64_t>(slots.size());
     clock.sites = static_cast<int64_t>(sites.number.size());
   }
@@ -165,8 +166,6 @@ class RankCut {
   bool needed(const int32_t* slots) const;
   void share_homes();
   void own_homes(Rank<T>& rank);
-  // First point of home h, or the number of points.
-  int64_t start_of(int64_t h) const { return h < s_.clock->homes ? s_.homes().start[h] : s_.count; }
   void find_held(const Rank<T>& rank);
   void fill(Rank<T>& rank);
   void find_halos();
@@ -186,15 +185,16 @@ void RankCut<T>::send(const F& home) {
   const HomeList<T>& list = s_.homes();
   std::vector<RankPoints<T>> points;
   std::vector<SolverView<T>> views(ranks_.size(), s_);
-  std::vector<int64_t> place(list.start, list.start + s_.clock->homes);  // in its rank, per home
+  std::vector<int64_t> place(s_.clock->homes);  // of the next point of each home, in its rank
   std::vector<int32_t> owner(s_.clock->homes);
   for (size_t r = 0; r < ranks_.size(); ++r) {
-    const int64_t first = ranks_[r].first_home, end = first + ranks_[r].homes;
-    points.emplace_back(s_, start_of(end) - start_of(first));
-    for (int64_t h = first; h < end; ++h) {
-      place[h] -= list.start[first];
+    int64_t count = 0;
+    for (const int64_t h : ranks_[r].homes) {
+      place[h] = count;
       owner[h] = static_cast<int32_t>(r);
+      count += list.count[h];
     }
+    points.emplace_back(s_, count);
   }
   for (size_t r = 0; r < ranks_.size(); ++r) points[r].show(views[r]);
   for (size_t r = 0; r < ranks_.size(); ++r)
