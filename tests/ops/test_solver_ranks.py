@@ -170,6 +170,25 @@ def test_sparse_points_that_drift_keep_the_bits(seed: int) -> None:
         assert_equal(run(given, ranks, 60), one)
 
 
+def test_a_point_counts_at_a_shared_block_that_its_home_does_not_reach() -> None:
+    """It comes next to a block that only another rank's points need, and two fields meet there."""
+    given = small("elastic")
+    here = [[0.95, y, 1.5] for y in (1.2, 1.5, 1.8)]  # in cells; goes to the right
+    there = [[5.05, 1.3, 1.4], [5.05, 1.6, 1.4], [5.08, 1.4, 1.7], [5.08, 1.7, 1.7]]
+    speed = torch.tensor([[2.0, 0.0, 0.0]] * 3 + [[-2.0, 0.0, 0.0]] * 2 + [[-2.6, 0.0, -0.5]] * 2)
+    few = {name: value[:7] if isinstance(value, torch.Tensor) and value.shape[0] > 7 else value
+           for name, value in given.items()} | {
+        "position": DX * (torch.tensor(here + there, dtype=torch.float64) + 0.5),
+        "velocity": speed.double(), "strain": torch.zeros(7, 6, dtype=torch.float64),
+        "body": torch.tensor([0] * 5 + [1] * 2, dtype=torch.int32),
+        "colliders": None, "gravity": (0.0, 0.0, 0.0), "frame": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+    one, two = (run(few, ranks, 6, dt=1e-3) for ranks in (1, 2))
+    assert [part["points"] for part in two.rank_counts()] == [3, 4]
+    assert two.counters()["builds"] == 1 and two.counters()["contact_nodes"] > 0
+    assert_equal(two, one)
+
+
 def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
     given = side_by_side(torch.float32)
     two = run(given, 2)
