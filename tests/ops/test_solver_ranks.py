@@ -157,17 +157,17 @@ def test_any_number_of_ranks_gives_the_bits_of_one_through_many_builds(dtype: to
     assert empty and all(part["slots"] == 0 for part in empty)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_sparse_points_that_drift_keep_the_bits(seed: int) -> None:
-    """What a home reaches is its own affair; which fields meet where is everybody's."""
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("parent", [[0, 1, 2], [0, 0, 1], [0, 0, 0]], ids=str)
+def test_sparse_points_that_drift_keep_the_bits(parent: list[int], seed: int) -> None:
+    """What a home reaches is its own affair; which fields meet or move as one is everybody's."""
     given = dust(torch.float32, seed)
-    if seed % 2 == 1:  # two of the three move as one
-        given["parent"] = torch.tensor([0, 0, 1], dtype=torch.int32)
-        given["cut"] = torch.zeros(3, dtype=torch.int32)
-    one = run(given, 1, 60)
-    assert one.counters()["contact_nodes"] > 0
-    for ranks in (2, 5, 8):
-        assert_equal(run(given, ranks, 60), one)
+    given["parent"] = torch.tensor(parent, dtype=torch.int32)
+    given["cut"] = torch.zeros(3, dtype=torch.int32)
+    one = run(given, 1, 50)
+    assert (one.counters()["contact_nodes"] > 0) == (len(set(parent)) > 1)
+    for ranks in (2, 7):
+        assert_equal(run(given, ranks, 50), one)
 
 
 def test_a_point_counts_at_a_shared_block_that_its_home_does_not_reach() -> None:
