@@ -44,7 +44,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("solver_prime(Tensor(a!)[] buffers, int[] ints, float[] floats) -> ()");
   m.def(
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
-  m.def("solver_ranks(Tensor(a!)[] buffers, int[] ints, float[] floats) -> Tensor");
+  m.def("solver_ranks(Tensor[] buffers, int[] ints, float[] floats) -> Tensor");
 
   m.def("blade_sides(Tensor position, Tensor blades, Tensor cut, float reach) -> Tensor");
 

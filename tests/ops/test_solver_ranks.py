@@ -78,6 +78,21 @@ def cut_by_a_blade(dtype: torch.dtype) -> dict[str, Any]:
     }
 
 
+def dust(dtype: torch.dtype, seed: int = 0) -> dict[str, Any]:
+    """Points of three bodies anywhere, so that homes hold few, reach little and drift apart."""
+    given = small("elastic", dtype)
+    n = 300
+    generator = torch.Generator().manual_seed(seed)
+    lot = torch.rand(n, 7, generator=generator, dtype=torch.float64)
+    return {name: value[:n] if isinstance(value, torch.Tensor) and value.shape[0] > n else value
+            for name, value in given.items()} | {
+        "position": lot[:, :3] * torch.tensor([20 * DX, 10 * DX, 6 * DX], dtype=torch.float64),
+        "velocity": (4.0 * (lot[:, 3:6] - 0.5)).to(dtype),
+        "body": (3.0 * lot[:, 6]).int(),
+        "colliders": None, "frame": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+
+
 CASES = {
     "free": free,
     "nacc": lambda dtype: small("nacc", dtype),
@@ -142,6 +157,38 @@ def test_any_number_of_ranks_gives_the_bits_of_one_through_many_builds(dtype: to
     assert empty and all(part["slots"] == 0 for part in empty)
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("parent", [[0, 1, 2], [0, 0, 1], [0, 0, 0]], ids=str)
+def test_sparse_points_that_drift_keep_the_bits(parent: list[int], seed: int) -> None:
+    """What a home reaches is its own affair; which fields meet or move as one is everybody's."""
+    given = dust(torch.float32, seed)
+    given["parent"] = torch.tensor(parent, dtype=torch.int32)
+    given["cut"] = torch.zeros(3, dtype=torch.int32)
+    one = run(given, 1, 50)
+    assert (one.counters()["contact_nodes"] > 0) == (len(set(parent)) > 1)
+    for ranks in (2, 7):
+        assert_equal(run(given, ranks, 50), one)
+
+
+def test_a_point_counts_at_a_shared_block_that_its_home_does_not_reach() -> None:
+    """It comes next to a block that only another rank's points need, and two fields meet there."""
+    given = small("elastic")
+    here = [[0.95, y, 1.5] for y in (1.2, 1.5, 1.8)]  # in cells; goes to the right
+    there = [[5.05, 1.3, 1.4], [5.05, 1.6, 1.4], [5.08, 1.4, 1.7], [5.08, 1.7, 1.7]]
+    speed = torch.tensor([[2.0, 0.0, 0.0]] * 3 + [[-2.0, 0.0, 0.0]] * 2 + [[-2.6, 0.0, -0.5]] * 2)
+    few = {name: value[:7] if isinstance(value, torch.Tensor) and value.shape[0] > 7 else value
+           for name, value in given.items()} | {
+        "position": DX * (torch.tensor(here + there, dtype=torch.float64) + 0.5),
+        "velocity": speed.double(), "strain": torch.zeros(7, 6, dtype=torch.float64),
+        "body": torch.tensor([0] * 5 + [1] * 2, dtype=torch.int32),
+        "colliders": None, "gravity": (0.0, 0.0, 0.0), "frame": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+    one, two = (run(few, ranks, 6, dt=1e-3) for ranks in (1, 2))
+    assert [part["points"] for part in two.rank_counts()] == [3, 4]
+    assert two.counters()["builds"] == 1 and two.counters()["contact_nodes"] > 0
+    assert_equal(two, one)
+
+
 def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
     given = side_by_side(torch.float32)
     two = run(given, 2)
@@ -149,6 +196,22 @@ def test_two_bodies_that_meet_at_the_cut_are_held_by_a_rank_each() -> None:
     # but for points that share a block with the other body
     assert all(abs(part["points"] - half) < 8 for part in two.rank_counts())
     assert two.counters()["contact_nodes"] > 0
+
+
+def test_the_cut_is_across_the_longest_axis() -> None:
+    """A column shares the same few blocks whichever way it stands."""
+    given = small("elastic", torch.float32) | {"colliders": None, "gravity": (0.0, 0.0, 0.0)}
+    step = 5 * DX * torch.arange(6, dtype=torch.float64)[:, None, None]
+    for name in ("velocity", "mass", "volume", "alpha", "material", "strain", "body"):
+        given[name] = given[name].repeat(6, *[1] * (given[name].dim() - 1))
+    shared = []
+    for axis in range(3):
+        away = step * torch.eye(3, dtype=torch.float64)[axis]
+        column = (given["position"] + away).reshape(-1, 3)
+        two = run(given | {"position": column}, 2, 1)
+        shared.append(two.rank_counts()[0]["shared"])
+        assert shared[-1] < 0.35 * two.counters()["slots"]
+    assert max(shared) < 1.5 * min(shared)
 
 
 def test_a_build_cuts_anew() -> None:

@@ -10,12 +10,6 @@ namespace {
 constexpr int64_t kHaloGrain = 16;
 enum Held : uint8_t { kHeld = 1, kNeeded = 2 };
 
-// Row `first` of an array with so many columns that may be absent.
-template <typename W>
-W* row_at(W* array, int64_t first, int columns = 1) {
-  return array != nullptr ? array + first * columns : nullptr;
-}
-
 }  // namespace
 
 void Agreement::share(Touched mark, int64_t bytes, const std::vector<void*>& of_rank) {
@@ -66,6 +60,41 @@ void Agreement::agree(Array& array, int64_t halo) const {
 }
 
 template <typename T>
+RankCut<T>::RankCut(const SolverView<T>& s) : s_(s), ranks_(s.ranks) {
+  if (!several()) {
+    ranks_[0].view = s;
+    return;
+  }
+  const HomeList<T>& list = s.homes();
+  int64_t held = 0;
+  bool sound = s.clock->homes >= 0 && s.clock->homes <= s.home_capacity;
+  for (int64_t h = 0; sound && h < s.clock->homes; ++h) {
+    sound = list.start[h] == held && list.count[h] >= 0 && list.count[h] <= s.count - held;
+    held += list.count[h];
+  }
+  STD_TORCH_CHECK(sound && held == s.count,
+                  "solver: several ranks need the points in the order of their homes");
+  share_homes();
+  for (Rank<T>& rank : ranks_) {
+    int64_t count = 0;
+    for (const int64_t h : rank.homes) count += list.count[h];
+    rank.points = RankPoints<T>(s, count);
+    own_homes(rank);
+    for (size_t i = 0; i < rank.homes.size(); ++i)
+      copy_points(s, list.start[rank.homes[i]], rank.home_count[i], rank.view, rank.home_start[i]);
+  }
+}
+
+template <typename T>
+void RankCut<T>::gather() const {
+  if (!several()) return;
+  for (const Rank<T>& rank : ranks_)
+    for (size_t i = 0; i < rank.homes.size(); ++i)
+      copy_points(rank.view, rank.home_start[i], rank.home_count[i], s_,
+                  s_.homes().start[rank.homes[i]]);
+}
+
+template <typename T>
 void RankCut<T>::make() {
   const SolverClock& c = *s_.clock;
   if (!several()) {
@@ -86,18 +115,37 @@ void RankCut<T>::make() {
   find_halos();
 }
 
-// Stretches of homes with about as many points each.
+// Cuts across the longest axis, with about as many points on each side as there are ranks to come.
 template <typename T>
 void RankCut<T>::share_homes() {
   const HomeList<T>& list = s_.homes();
   const int64_t homes = s_.clock->homes, ranks = static_cast<int64_t>(ranks_.size());
-  const auto first_of = [&](int64_t r) {
-    return std::lower_bound(list.start, list.start + homes, r * s_.count / ranks) - list.start;
-  };
-  for (int64_t r = 0; r < ranks; ++r) {
-    ranks_[r].first_home = r == 0 ? 0 : first_of(r);
-    ranks_[r].homes = (r + 1 == ranks ? homes : first_of(r + 1)) - ranks_[r].first_home;
+  int axis = 0;
+  int32_t longest = -1;
+  for (int a = 0; a < 3; ++a) {
+    int32_t low = kBlockRange, high = -kBlockRange;
+    for (int64_t h = 0; h < homes; ++h) {
+      low = std::min(low, list.coord[4 * h + a]);
+      high = std::max(high, list.coord[4 * h + a]);
+    }
+    if (high - low > longest) {
+      longest = high - low;
+      axis = a;
+    }
   }
+  std::vector<int64_t> along(homes);
+  std::iota(along.begin(), along.end(), 0);
+  std::stable_sort(along.begin(), along.end(), [&](int64_t a, int64_t b) {
+    return list.coord[4 * a + axis] < list.coord[4 * b + axis];
+  });
+  for (Rank<T>& rank : ranks_) rank.homes.clear();
+  int64_t r = 0, before = 0;
+  for (const int64_t h : along) {
+    while (r + 1 < ranks && before >= (r + 1) * s_.count / ranks) ++r;
+    ranks_[r].homes.push_back(h);
+    before += list.count[h];
+  }
+  for (Rank<T>& rank : ranks_) std::sort(rank.homes.begin(), rank.homes.end());
 }
 
 template <typename T>
@@ -113,7 +161,7 @@ template <typename T>
 void RankCut<T>::find_held(const Rank<T>& rank) {
   held_.assign(s_.clock->slots, 0);
   const auto hold = [&](int64_t i) { held_[i] = std::max<uint8_t>(held_[i], kHeld); };
-  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+  for (const int64_t h : rank.homes)
     for (int n = 0; n < kNeighbours; ++n) {
       const int32_t below = slot(s_.neighbour[kNeighbours * h + n]);
       if (below >= 0) held_[below] = kNeeded;
@@ -127,7 +175,7 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
       if (at != slot_key_.end() && *at == key) f(at - slot_key_.begin());
     }
   };
-  for (int64_t h = rank.first_home; h < rank.first_home + rank.homes; ++h)
+  for (const int64_t h : rank.homes)
     around(s_.homes().coord + 4 * h, [&](int64_t i) {
       if (s_.slot_shared[i] != 0) hold(i);
     });
@@ -143,16 +191,33 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
   }
 }
 
+// The rank's view of its points and homes.
+template <typename T>
+void RankCut<T>::own_homes(Rank<T>& rank) {
+  const HomeList<T>& list = s_.homes();
+  rank.home_coord.clear();
+  rank.home_start.clear();
+  rank.home_count.clear();
+  int32_t at = 0;
+  for (const int64_t h : rank.homes) {
+    rank.home_coord.insert(rank.home_coord.end(), list.coord + 4 * h, list.coord + 4 * h + 4);
+    rank.home_start.push_back(at);
+    rank.home_count.push_back(list.count[h]);
+    at += list.count[h];
+  }
+  rank.view = s_;
+  rank.points.show(rank.view);
+  rank.view.clock = &rank.clock;
+  rank.view.home_capacity = static_cast<int64_t>(rank.homes.size());
+  rank.view.home[0] =
+      rank.view.home[1] = {rank.home_coord.data(), rank.home_start.data(), rank.home_count.data()};
+  rank.tell(*s_.clock);
+}
+
 // The rank's own lists of what find_held found, and its view.
 template <typename T>
 void RankCut<T>::fill(Rank<T>& rank) {
-  const HomeList<T>& list = s_.homes();
-  const int64_t home = rank.first_home, end = home + rank.homes;
-  const auto start_of = [&](int64_t h) {
-    return h < s_.clock->homes ? std::clamp<int64_t>(list.start[h], 0, s_.count) : s_.count;
-  };
-  const int64_t first = start_of(home), last = std::max(first, start_of(end));
-
+  own_homes(rank);
   std::vector<int32_t> number(s_.clock->slots, -1);
   rank.slots.clear();
   rank.slot_coord.clear();
@@ -175,12 +240,10 @@ void RankCut<T>::fill(Rank<T>& rank) {
     answered_[i] = 1;
     for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
   }
-  rank.home_start.resize(rank.homes);
-  rank.neighbour.resize(kNeighbours * rank.homes);
-  for (int64_t h = 0; h < rank.homes; ++h)
-    rank.home_start[h] = static_cast<int32_t>(list.start[home + h] - first);
-  for (int64_t i = 0; i < kNeighbours * rank.homes; ++i)
-    rank.neighbour[i] = own(s_.neighbour[kNeighbours * home + i]);
+  rank.neighbour.clear();
+  for (const int64_t h : rank.homes)
+    for (int n = 0; n < kNeighbours; ++n)
+      rank.neighbour.push_back(own(s_.neighbour[kNeighbours * h + n]));
   const int64_t nodes = static_cast<int64_t>(rank.slots.size()) * kBlockNodes;
   rank.touched.assign(rank.slots.size(), 0);
   rank.sums.assign(4 * nodes, 0.0);
@@ -188,24 +251,7 @@ void RankCut<T>::fill(Rank<T>& rank) {
   rank.node_velocity.assign(4 * nodes, T(0));
 
   SolverView<T>& v = rank.view;
-  v = s_;
-  v.count = last - first;
-  v.home_capacity = rank.homes;
   v.slot_capacity = static_cast<int64_t>(rank.slots.size());
-  v.clock = &rank.clock;
-  v.offset = row_at(s_.offset, first, 3);
-  v.meta = row_at(s_.meta, first);
-  v.velocity = row_at(s_.velocity, first, 3);
-  v.slope = row_at(s_.slope, first, 9);
-  v.strain = row_at(s_.strain, first, 6);
-  v.alpha = row_at(s_.alpha, first);
-  v.peak = row_at(s_.peak, first);
-  v.deformation = row_at(s_.deformation, first, 9);
-  v.viscous = row_at(s_.viscous, first, kViscousColumns);
-  v.own = row_at(s_.own, first, 9);
-  v.id = row_at(s_.id, first);
-  v.entry = row_at(s_.entry, first);
-  v.home[0] = v.home[1] = {list.coord + 4 * home, rank.home_start.data(), list.count + home};
   v.neighbour = rank.neighbour.data();
   v.slot_coord = rank.slot_coord.data();
   v.slot_shared = rank.slot_shared.data();

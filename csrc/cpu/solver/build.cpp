@@ -6,7 +6,7 @@
 #include <cstring>
 #include <type_traits>
 
-#include "cpu/solver/solver.h"
+#include "cpu/ranks/ranks.h"
 
 namespace gsf::cpu {
 namespace {
@@ -38,6 +38,54 @@ class Builder {
     sort_particles();
     move_particles();
     store();
+  }
+
+  // The same over several ranks. On each: what homes its points need. False when one has none.
+  bool survey() {
+    check_homes();
+    return find_homes();
+  }
+  // Of all: their homes and slots; false, and nothing changed, when there is no room for them.
+  bool join(const std::vector<Builder>& ranks) {
+    for (const Builder& rank : ranks)
+      next_.insert(next_.end(), rank.next_.begin(), rank.next_.end());
+    std::stable_sort(next_.begin(), next_.end(),
+                     [](const NewHome& a, const NewHome& b) { return a.key < b.key; });
+    size_t homes = 0;
+    for (const NewHome& home : next_) {
+      if (homes == 0 || next_[homes - 1].key != home.key) {
+        next_[homes++] = home;
+        continue;
+      }
+      next_[homes - 1].count += home.count;
+      next_[homes - 1].reach |= home.reach;
+    }
+    next_.resize(homes);
+    int64_t at = 0;
+    for (NewHome& home : next_) {
+      home.start = at;
+      at += home.count;
+    }
+    return find_slots();
+  }
+  // Of all: lists of blocks and clock.
+  void store();
+  uint64_t home_key(int64_t p) const { return next_[owner_[p]].key; }
+  int64_t number(uint64_t key) const {
+    return std::lower_bound(next_.begin(), next_.end(), key,
+                            [](const NewHome& home, uint64_t k) { return home.key < k; }) -
+           next_.begin();
+  }
+  // Meta word in the new home: l counts from there, cell of the block plus one.
+  uint32_t new_meta(int64_t p) const {
+    return pack_meta((cell(p, 0) & 3) + 1, (cell(p, 1) & 3) + 1, (cell(p, 2) & 3) + 1,
+                     meta_row(s_.meta[p]));
+  }
+  // On each, with the points that it got: their order in their homes.
+  void order() {
+    survey();
+    sort_particles();
+    move_particles();
   }
 
  private:
@@ -227,10 +275,7 @@ class Builder {
   }
 
   void move_particles() {
-    // l counts from the new home: cell of the block plus one.
-    for (int64_t p = 0; p < s_.count; ++p)
-      s_.meta[p] = pack_meta((cell(p, 0) & 3) + 1, (cell(p, 1) & 3) + 1, (cell(p, 2) & 3) + 1,
-                             meta_row(s_.meta[p]));
+    for (int64_t p = 0; p < s_.count; ++p) s_.meta[p] = new_meta(p);
     move(s_.offset, 3);
     move(s_.meta, 1);
     move(s_.velocity, 3);
@@ -244,52 +289,6 @@ class Builder {
     move(s_.id, 1);
   }
 
-  void store() {
-    SolverView<T> s = s_;
-    const HomeList<T>& list = s.next_homes();
-    for (size_t h = 0; h < next_.size(); ++h) {
-      for (int axis = 0; axis < 3; ++axis) list.coord[4 * h + axis] = key_block(next_[h].key, axis);
-      list.coord[4 * h + 3] = key_field(next_[h].key);
-      list.start[h] = static_cast<int32_t>(next_[h].start);
-      list.count[h] = static_cast<int32_t>(next_[h].count);
-    }
-    // Keys of one neighbour grow with the keys of the homes: one walk per neighbour.
-    for (int n = 0; n < kNeighbours; ++n) {
-      size_t slot = 0;
-      for (size_t h = 0; h < next_.size(); ++h) {
-        int32_t& entry = s.neighbour[kNeighbours * h + n];
-        entry = -1;
-        if (!in_reach(next_[h].reach, n)) continue;
-        const uint64_t key = neighbour_key(next_[h].key, n);
-        while (slots_[slot] != key) ++slot;
-        entry = static_cast<int32_t>(slot);
-      }
-    }
-    clock_.sites = clock_.shared_sites = 0;
-    for (size_t first = 0, end = 0; first < slots_.size(); first = end) {
-      while (end < slots_.size() && slots_[end] >> kFieldBits == slots_[first] >> kFieldBits) ++end;
-      int32_t* site = s.site_slots + kSiteFields * clock_.sites;
-      const int parts = parting(first, end) ? 1 : 0;
-      for (int i = 0; i < kSiteFields; ++i)
-        site[i] = first + i < end ? static_cast<int32_t>(first + i) : -1;
-      for (size_t slot = first; slot < end; ++slot) {
-        for (int axis = 0; axis < 3; ++axis)
-          s.slot_coord[4 * slot + axis] = key_block(slots_[slot], axis);
-        s.slot_coord[4 * slot + 3] = key_field(slots_[slot]);
-        s.slot_shared[slot] = parts;
-      }
-      clock_.sites += 1;
-      clock_.shared_sites += parts;
-    }
-    clock_.homes = static_cast<int64_t>(next_.size());
-    clock_.slots = static_cast<int64_t>(slots_.size());
-    clock_.homes_max = std::max(clock_.homes_max, clock_.homes);
-    clock_.slots_max = std::max(clock_.slots_max, clock_.slots);
-    clock_.parity = 1 - (clock_.parity & 1);
-    clock_.rebuild = 0;
-    clock_.builds += 1;
-  }
-
   const SolverView<T>& s_;
   SolverClock& clock_;
   int64_t homes_ = 0;
@@ -299,13 +298,81 @@ class Builder {
   std::vector<uint64_t> slots_;
 };
 
+template <typename T>
+void Builder<T>::store() {
+  SolverView<T> s = s_;
+  const HomeList<T>& list = s.next_homes();
+  for (size_t h = 0; h < next_.size(); ++h) {
+    for (int axis = 0; axis < 3; ++axis) list.coord[4 * h + axis] = key_block(next_[h].key, axis);
+    list.coord[4 * h + 3] = key_field(next_[h].key);
+    list.start[h] = static_cast<int32_t>(next_[h].start);
+    list.count[h] = static_cast<int32_t>(next_[h].count);
+  }
+  // Keys of one neighbour grow with the keys of the homes: one walk per neighbour.
+  for (int n = 0; n < kNeighbours; ++n) {
+    size_t slot = 0;
+    for (size_t h = 0; h < next_.size(); ++h) {
+      int32_t& entry = s.neighbour[kNeighbours * h + n];
+      entry = -1;
+      if (!in_reach(next_[h].reach, n)) continue;
+      const uint64_t key = neighbour_key(next_[h].key, n);
+      while (slots_[slot] != key) ++slot;
+      entry = static_cast<int32_t>(slot);
+    }
+  }
+  clock_.sites = clock_.shared_sites = 0;
+  for (size_t first = 0, end = 0; first < slots_.size(); first = end) {
+    while (end < slots_.size() && slots_[end] >> kFieldBits == slots_[first] >> kFieldBits) ++end;
+    int32_t* site = s.site_slots + kSiteFields * clock_.sites;
+    const int parts = parting(first, end) ? 1 : 0;
+    for (int i = 0; i < kSiteFields; ++i)
+      site[i] = first + i < end ? static_cast<int32_t>(first + i) : -1;
+    for (size_t slot = first; slot < end; ++slot) {
+      for (int axis = 0; axis < 3; ++axis)
+        s.slot_coord[4 * slot + axis] = key_block(slots_[slot], axis);
+      s.slot_coord[4 * slot + 3] = key_field(slots_[slot]);
+      s.slot_shared[slot] = parts;
+    }
+    clock_.sites += 1;
+    clock_.shared_sites += parts;
+  }
+  clock_.homes = static_cast<int64_t>(next_.size());
+  clock_.slots = static_cast<int64_t>(slots_.size());
+  clock_.homes_max = std::max(clock_.homes_max, clock_.homes);
+  clock_.slots_max = std::max(clock_.slots_max, clock_.slots);
+  clock_.parity = 1 - (clock_.parity & 1);
+  clock_.rebuild = 0;
+  clock_.builds += 1;
+}
+
 }  // namespace
 
 template <typename T>
 void solver_build(const SolverView<T>& s) {
   Builder<T>(s).run();
 }
+
+template <typename T>
+void solver_build(const SolverView<T>& s, RankCut<T>& cut) {
+  std::vector<Builder<T>> ranks;
+  for (const Rank<T>& rank : cut.ranks()) {
+    if (ranks.emplace_back(rank.view).survey()) continue;
+    s.clock->reason = rank.clock.reason;
+    return;
+  }
+  Builder<T> all(s);
+  if (!all.join(ranks)) return;
+  all.store();
+  cut.send([&](size_t r, int64_t p, uint32_t& meta) {
+    meta = ranks[r].new_meta(p);
+    return all.number(ranks[r].home_key(p));
+  });
+  for (const Rank<T>& rank : cut.ranks()) Builder<T>(rank.view).order();
+}
+
 template void solver_build<float>(const SolverView<float>&);
 template void solver_build<double>(const SolverView<double>&);
+template void solver_build(const SolverView<float>&, RankCut<float>&);
+template void solver_build(const SolverView<double>&, RankCut<double>&);
 
 }  // namespace gsf::cpu

@@ -50,11 +50,8 @@ class NodePass {
         double* impulse = impulse_.data() + chunk * terms;
         std::fill(impulse, impulse + terms, 0.0);
         contacts_[chunk] = 0;
-        Account account{impulse, nullptr, 0};
-        if (sites_ != nullptr) {
-          given_[chunk].clear();
-          account.list = &given_[chunk];
-        }
+        Account account{impulse, sites_ != nullptr ? &given_[chunk] : nullptr, 0};
+        if (sites_ != nullptr) given_[chunk].clear();
         const int64_t last = std::min((chunk + 1) * kSiteChunk, c.sites);
         for (int64_t index = chunk * kSiteChunk; index < last; ++index) {
           const Site here = site(index, touched);

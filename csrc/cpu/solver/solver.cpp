@@ -80,6 +80,15 @@ class Lockstep {
       ranks_.push_back(std::make_unique<Stepper<T>>(rank, laws, cut_.several()));
   }
 
+  void build() {
+    if (cut_.several())
+      solver_build(s_, cut_);
+    else
+      solver_build(s_);
+  }
+  // After the last step.
+  void gather() { cut_.gather(); }
+
   // Again after each build.
   void plan() {
     const SolverClock& c = *s_.clock;
@@ -215,12 +224,13 @@ struct Cpu {
     if (may_step(c)) ranks.plan();
     for (int64_t i = 0; i < rounds * steps; ++i) {
       if (may_build(c)) {
-        solver_build(s);
+        ranks.build();
         if (may_step(c)) ranks.plan();
       }
-      if (!may_step(c)) return;
+      if (!may_step(c)) break;
       ranks.step();
     }
+    ranks.gather();
   }
 };
 
