@@ -9,7 +9,6 @@ __getattr__, __dir__, __all__ = room(
     cuts="save_cut_views",
     figures="FilmFigures",
     film="Film captured_backdrop poster_frame studio_is_dark",
-    merge="merged",
     path="Cut FREEZE_SECONDS freeze",
     stage="Render",
     studio="Studio",
