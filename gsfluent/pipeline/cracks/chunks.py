@@ -32,7 +32,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
-from gsfluent.pipeline.cracks.followers import WIDE, Followers, chips, motions, neighbours
+from gsfluent.pipeline.cracks.followers import WIDE, Followers, Lent, chips, motions, neighbours
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
@@ -109,6 +109,7 @@ class Chunks:
         self._region = self.base.body.clone()
         self._owner = self.base.owner
         self._links = self.base.links
+        self._lent = Lent(self._owner[:0], self._owner[:0])
         torn: list[Torn] = []
         done = list(state.get("splits", ()))
         while done:
@@ -202,11 +203,11 @@ class Chunks:
         if not self._events:
             return cracks
         rest = self._cut(cracks.rest, carry, cracks.points)
-        parts = [cracks.births, self._born(carry, cracks.points)]
         dust = self._dust.born(points.position)
-        births = Births.joined([*parts, dust])
+        births = Births.joined([cracks.births, self._born(carry, cracks.points), dust])
         thrown = None if dust is None else self._dust.thrown()
-        return Cracks(cracks.points, rest, births, carry, thrown)
+        lent = carry.place(self.base.matter.rest[self._lent.rows], self._lent.owner, cracks.points)
+        return Cracks(cracks.points, rest, births, carry, thrown, (self._lent.rows, lent[0]))
 
     # --- what belongs together ---
 
@@ -394,10 +395,8 @@ class Chunks:
     def _led_by(self, lone: Tensor, rows: Tensor) -> None:
         """Some points go on with the chunk of the nearest of some rows, where there are any."""
         if lone.numel() and rows.numel():
-            rest, spacing = (
-                self.base.matter.rest,
-                self.base.matter.spacing[int(self._body[rows[0]])],
-            )
+            rest = self.base.matter.rest
+            spacing = self.base.matter.spacing[int(self._body[rows[0]])]
             near = rows[nearest_rows(rest[rows], rest[lone], 1, spacing)[1][:, 0]]
             self._chunk = self._chunk.index_copy(0, lone, self._chunk[near])
 
@@ -430,6 +429,7 @@ class Chunks:
     def _relink(self) -> None:
         """Every point has neighbours of its own chunk."""
         base, chunk = self.base.links, self._chunk
+        self._lent = Lent.of(self._partitions, self.base.matter, chunk, self._may & ~self._gone)
         stale = (chunk[base.near] != chunk[:, None]).any(dim=1).nonzero()[:, 0]
         if stale.numel() == 0:
             self._links = base

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -9,7 +10,9 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.pipeline.matter.links import PARTED, Links
+from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.partition.threshold import CHIP
+from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.spatial.neighbours import nearest_in_group
 
 WIDE = 1.5
@@ -82,6 +85,49 @@ def neighbours(links: Links, chunk: Tensor, rows: Tensor, among: Tensor) -> tupl
     near = torch.where(lone, torch.where(lone[:, :1], rows[:, None], near[:, :1]), near)
     lone[:, 0] = False
     return near, lone
+
+
+class Lent(NamedTuple):
+    """Points whose matter is drawn with another chunk than theirs.
+
+    A partition is smooth: of a spike of points that sticks out of its piece, the neighbour has the
+    voxels. What these points are of is seen there.
+
+    Attributes:
+        rows: Which, int64 [R].
+        owner: The nearest point of the chunk that has their voxels, int64 [R].
+    """
+
+    rows: Tensor
+    owner: Tensor
+
+    @classmethod
+    def of(
+        cls, partitions: Mapping[int, Partition], matter: Matter, chunk: Tensor, there: Tensor
+    ) -> Lent:
+        """Find them, in the order of the bodies.
+
+        Args:
+            partitions: Of the bodies that have one.
+            matter: The points.
+            chunk: Of each of them, int64 [N].
+            there: Points that are not dust, bool [N].
+        """
+        rows, owner = [chunk[:0]], [chunk[:0]]
+        for body, partition in partitions.items():
+            a, b = matter.ranges[body]
+            rest, its = matter.rest[a:b], there[a:b].nonzero()[:, 0]
+            voxel, mine = partition.at(rest[its]), chunk[a:b]
+            off = ((voxel >= 0) & (voxel != mine[its])).nonzero()[:, 0]
+            if off.numel() == 0:
+                continue
+            near = nearest_in_group(
+                rest[its], mine[its], rest[its[off]], voxel[off], 1, matter.spacing[body]
+            )[1][:, 0]
+            found = near >= 0  # a region that has become dust has nobody
+            rows.append(its[off[found]] + a)
+            owner.append(its[near[found]] + a)
+        return cls(torch.cat(rows), torch.cat(owner))
 
 
 def chips(chunk: Tensor, there: Tensor, drive: Tensor, count: int, first: int) -> Tensor:

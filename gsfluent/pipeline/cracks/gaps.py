@@ -65,6 +65,8 @@ class Cracks(NamedTuple):
         births: Splats on open faces; None where there is none.
         carry: The binding that moves the splats.
         dust: Material points that are drawn as dust, int64 [D]; None where there are none.
+        lent: Points whose matter is drawn with another piece than theirs, int64 [L], and where
+            that is [m], [L, 3]; None where there are none.
     """
 
     points: Points
@@ -72,6 +74,7 @@ class Cracks(NamedTuple):
     births: Births | None
     carry: Carry
     dust: Tensor | None = None
+    lent: tuple[Tensor, Tensor] | None = None
 
 
 class Gaps:

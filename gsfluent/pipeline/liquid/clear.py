@@ -36,7 +36,7 @@ FINE = 2.0
 """Distance of the points from which on edges are sharpened, entirely at twice as much [px]."""
 ROUND = 0.7
 """Shortest over longest axis from which on a splat is a ball, more and more."""
-STEP = 2.0
+STEP = 3.0
 """What lies so many spacings deeper is another surface."""
 MOST_PIXELS = 12
 """Standard deviation of the smoothing, at most [px]."""
@@ -110,7 +110,8 @@ def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
     sigma = min(SMOOTH * spacing * float(camera.K[0, 0]) / middle, MOST_PIXELS)
     reach = math.ceil(2.5 * sigma)
     rows, columns = (_span(there.any(dim=dim)) for dim in (1, 0))
-    values = torch.cat([normalize(surface.normal, dim=2), depth[..., None]], dim=2)[rows, columns]
+    # the longer a blended normal is, the surer: near and far side of an outline cancel each other
+    values = torch.cat([surface.normal, depth[..., None]], dim=2)[rows, columns]
     weight = (surface.alpha * there)[rows, columns]
     for dim in (0, 1):
         # a window has no more than the picture

@@ -123,6 +123,7 @@ class Film:
             groups=frame.groups,
             gloss=gloss,
             plates=plates_of(frame),
+            rigid=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,
             room=self._room,

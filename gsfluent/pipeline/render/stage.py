@@ -38,6 +38,7 @@ from gsfluent.pipeline.liquid.clear import (
     surface_normals,
 )
 from gsfluent.pipeline.render.backdrop import Backdrop
+from gsfluent.pipeline.render.merge import merged
 from gsfluent.pipeline.render.studio import Studio
 from gsfluent.pipeline.stage import Stage
 
@@ -134,6 +135,7 @@ class Render(Stage):
         groups: Tensor | None = None,
         gloss: Tensor | None = None,
         plates: Tensor | None = None,
+        rigid: Tensor | None = None,
         backdrop: Backdrop | None = None,
         time: float = 0.0,
         room: Room | None = None,
@@ -149,6 +151,8 @@ class Render(Stage):
                 read when the light says what everything is like.
             plates: Flat splats whose shortest axis is the normal, bool [N]: those that draw rigid
                 things. All others take theirs from the density of the matter, too.
+            rigid: Splats that are set into the picture of the others pixel by pixel, bool [N]:
+                those of blades and such, which others touch and do not mix with.
             backdrop: Captured surroundings before the studio; None for none.
             time: Moment [s], for lamps that move.
             room: ``room`` of the picture before in a film, so that the grid behind normals and
@@ -171,8 +175,8 @@ class Render(Stage):
             dense = gaussians.select((~through).nonzero()[:, 0])
             rest = (~clear.rows).nonzero()[:, 0]
             gaussians = gaussians.select(rest)
-            groups, gloss, plates = (
-                None if value is None else value[rest] for value in (groups, gloss, plates)
+            groups, gloss, plates, rigid = (
+                None if value is None else value[rest] for value in (groups, gloss, plates, rigid)
             )
         else:
             clear = None
@@ -184,16 +188,24 @@ class Render(Stage):
                 extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
-        seen = draw_at(
-            gaussians,
-            *view,
-            (camera.width, camera.height),
-            near=_NEAR,
-            depth=True,
-            antialiased=self.antialiased,
-            normals=extras,
-            groups=groups,
+        layers: list[Tensor | None] = [None]
+        if rigid is not None and bool(rigid.any()):
+            layers = [(~rigid).nonzero()[:, 0], rigid.nonzero()[:, 0]]
+        seen, *others = (
+            draw_at(
+                gaussians if which is None else gaussians.select(which),
+                *view,
+                (camera.width, camera.height),
+                near=_NEAR,
+                depth=True,
+                antialiased=self.antialiased,
+                normals=extras if which is None or extras is None else extras[which],
+                groups=groups if which is None or groups is None else groups[which],
+            )
+            for which in layers
         )
+        for other in others:
+            seen = merged(seen, other, view[1][0, 0])
         assert seen.depth is not None  # asked for
         image, alpha, depth = seen.image, seen.alpha, seen.depth
         behind = _constant(self.background, means.dtype, means.device)

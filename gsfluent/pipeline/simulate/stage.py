@@ -102,13 +102,16 @@ class SimulationFrame:
 
     @property
     def led(self) -> tuple[Tensor, Tensor] | None:
-        """Points that are drawn elsewhere than they are, with their chunk, and where.
+        """Points whose matter is drawn elsewhere than they are, with its chunk, and where.
 
         Rows int32 [K] and places [m], [K, 3]; None where all are drawn where they are.
         """
         if self._points is None:
             return None
         places = self._points.position
+        if self._cracks is not None and self._cracks.lent is not None:
+            rows, there = self._cracks.lent
+            places = places.index_copy(0, rows, there.to(places))
         rows = (places != self.particles.position.to(places)).any(dim=1).nonzero()[:, 0]
         return (rows.to(torch.int32), places[rows]) if rows.numel() else None
 

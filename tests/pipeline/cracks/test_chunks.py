@@ -269,6 +269,30 @@ def test_crumbs_follow_what_is_firm(bound: Carry) -> None:
     assert float((thrown - bound.gaussians.means).norm(dim=1).max()) > 2.0 * spacing
 
 
+def test_matter_of_a_spike_is_where_it_is_drawn(bound: Carry) -> None:
+    """A partition is smooth: voxels of a thin spike go with the piece around it, and so does what
+    ought to be seen of its points. They would be looked for where nothing is drawn."""
+    rest, spacing = bound.matter.rest, bound.matter.spacing[0]
+    unit = halves(bound)
+    away = rest - torch.tensor([3.5 * spacing, 0.0, 0.0])
+    spike = (away[:, 1:].norm(dim=1) < spacing) & (away[:, 0].abs() < 3.5 * spacing)
+    spike &= rest[:, 0] > 0.0
+    unit[spike] = unit[rest[:, 0] < 0.0][0]
+    gap = apart(bound, 0.1) * ~spike[:, None]
+    history = Repair().begin(bound)
+    history.step(moment(bound, unit))
+    cracks = history.step(moment(bound, unit, gap))
+    assert cracks is not None and cracks.lent is not None
+    rows, there = cracks.lent
+    tip = rows[(spike & (rest[:, 0] > 2.0 * spacing))[rows]]
+    assert len(tip) > 4
+    arrived = there[torch.isin(rows, tip)] - rest[tip]
+    assert float((arrived - arrived.new_tensor([0.1, 0.0, 0.0])).norm(dim=1).max()) < 0.2 * spacing
+    assert float((cracks.points.position - rest)[tip].norm(dim=1).max()) < 0.2 * spacing
+    # what is not of a spike is drawn with its own
+    assert float(spike[rows].float().mean()) > 0.6
+
+
 @pytest.mark.parametrize(("far", "drawn_there"), [(0.8, True), (3.0, False)])
 def test_a_crack_band_that_strays_stays_where_its_piece_is(
     bound: Carry, far: float, drawn_there: bool

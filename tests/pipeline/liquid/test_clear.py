@@ -145,6 +145,14 @@ def test_a_thin_spot_of_a_film_is_no_dark_pit() -> None:
     assert float((made.depth - 2.0).abs().max()) < 0.1 * H
 
 
+def test_a_normal_that_is_unsure_goes_with_those_around() -> None:
+    """On an outline near and far side cancel; what was left of them was black."""
+    normal = torch.tensor([0.0, 0.0, 1.0]).repeat(80, 80, 1)
+    normal[40] = torch.tensor([0.1, 0.0, -0.02])
+    made = smoothed(Surface(torch.ones(80, 80), torch.full((80, 80), 2.0), normal), H, camera())
+    assert float(made.normal[..., 2].min()) > 0.99
+
+
 def test_drops_face_the_eye() -> None:
     """The shortest axis of a ball is any: a drop was lit from wherever it pointed."""
     eye = torch.tensor([0.0, 0.0, 2.0])
