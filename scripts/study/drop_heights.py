@@ -46,6 +46,8 @@ CRUSHED = 0.5
 """Share of the mass that ever broke from which a specimen is broken, in however many pieces."""
 HAIRLINE = 0.005
 """Share of an egg's shell or of a pane that ever broke from which it is cracked."""
+PASSED = 0.01
+"""Share of a fruit's matter above its middle that ever broke from which it is cracked."""
 SHELL = 4.0
 """How many times thicker the shell of the egg is made; see :func:`thicker`."""
 FRAME = 8.0
@@ -71,6 +73,7 @@ class Case:
         cells: Cells across its wall or, where it is solid, across its longest side.
         limit: Longest time of a fall, in traversals of the longest side by the wave.
         hairline: Whether a crack is enough.
+        fruit: Whether a crack that has passed the middle is enough.
         prefer: What a grid keeps that is too coarse for both; a height is a matter of strength.
         rabbet: Width of the ledge of a frame on which its edges lie [m], or None: it falls free.
     """
@@ -80,6 +83,7 @@ class Case:
     cells: float
     limit: float
     hairline: bool = False
+    fruit: bool = False
     prefer: str = "toughness"
     rabbet: float | None = None
 
@@ -116,7 +120,8 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
         )
     if name == "bread":
         return Case(name, turned(box(tuple(given["size_m"])), "y", 5.0), 32.0, 40.0)
-    return Case(name, ball(given["diameter_m"]), 32.0, 40.0)
+    fruit = given["preset"].startswith("fruit.")
+    return Case(name, ball(given["diameter_m"]), 32.0, 40.0, fruit=fruit)
 
 
 def thicker(material: Material, factor: float, mass: float, volume: float) -> Material:
@@ -158,6 +163,7 @@ class Fall:
     largest: float
     pieces: int
     ever: float
+    above: float
     loose: float
     restitution: float
     shaking: float
@@ -302,6 +308,8 @@ class Drop:
         ).double())  # fmt: skip
         energy = 0.5 * total * landing**2
         ever, loose = each(mass * state.ever) / total, each(mass * (pieces.labels < 0)) / total
+        high = mass * (run.matter.particles.position[:, 2] > max(self.case.shape.half))
+        above = each(high * state.ever) / each(high)
         for i, (height, seed) in enumerate(specimens):
             mine = (body == i) & (pieces.labels >= 0)
             shares = torch.zeros_like(mass).index_add_(0, pieces.labels[mine].long(), mass[mine])
@@ -309,9 +317,11 @@ class Drop:
             largest, large = float(shares.max()), int((shares > 0.01).sum())
             parted = largest < WHOLE or large >= 2
             enough = HAIRLINE if self.case.hairline else CRUSHED
+            broken = parted or float(ever[i]) > enough
+            broken = broken or (self.case.fruit and float(above[i]) > PASSED)
             self.falls.append(Fall(
-                height, seed, parted or float(ever[i]) > enough, parted, largest, large,
-                float(ever[i]), float(loose[i]),
+                height, seed, broken, parted, largest, large,
+                float(ever[i]), float(above[i]), float(loose[i]),
                 float(rebound[i] / landing[i]), float(shaking[i] / energy[i]),
                 float(stored[i] / energy[i]), bool(left[i]),
             ))  # fmt: skip

@@ -23,7 +23,7 @@ def drops() -> ModuleType:
 
 
 def fall(drops: ModuleType, height: float, broken: bool, seed: int = 0) -> object:
-    return drops.Fall(height, seed, broken, broken, 1.0, 1, 0.0, 0.0, 0.5, 0.0, 0.0, True)
+    return drops.Fall(height, seed, broken, broken, 1.0, 1, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, True)
 
 
 def test_a_tiny_ball_from_end_to_end(
@@ -136,3 +136,21 @@ def test_the_real_stiffness_is_that_of_the_handbook(drops: ModuleType) -> None:
     same = materials.get("bread")
     assert drops.stiff(same, "real") is same
     assert dataclasses.is_dataclass(melon) and torch.is_tensor(melon.parameters())
+
+
+def test_a_fruit_is_cracked_by_what_broke_above_its_middle(drops: ModuleType) -> None:
+    heights = drops.tomllib.loads((drops.DATA / "drop_heights.toml").read_text())
+    assert drops.case_of("apple", heights["apple"]).fruit
+    assert not drops.case_of("plaster_ball", heights["plaster_ball"]).fruit
+    falls = {}
+    for fruit in (True, False):
+        case = dataclasses.replace(
+            drops.case_of("watermelon", heights["watermelon"]), cells=10.0, fruit=fruit
+        )
+        drop = drops.Drop(case, heights["watermelon"], "preset", "cpu", False)
+        drop.fall([(0.05, 0), (0.9, 0)], 1e6)
+        falls[fruit] = drop.falls
+    low, high = falls[True]
+    assert not low.broken and low.above == low.ever == 0.0
+    assert high.above > drops.PASSED and high.ever < drops.CRUSHED and not high.parted
+    assert high.broken and not falls[False][1].broken
