@@ -233,13 +233,22 @@ def simulate_stage(context: RunContext) -> None:
 def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
     """What of a simulated frame goes to disk.
 
-    Splats of the solids, then of bullets, liquids and rigid things, then transitions.
+    Splats of the solids, then of bullets, liquids and rigid things, then transitions. What of a
+    solid is liquid is drawn as one, and not by the splats that were bound to it.
     """
     repaired = frame.repaired
     gaussians, groups, ids = repaired.gaussians, repaired.groups, repaired.ids
     anchor, carried = repaired.anchor, frame.carried.count
     points = bare_points(frame.particles, scene)
     bare = bare_splats(frame.particles, scene)
+    if liquid := frame.liquid:
+        kept = (~liquid.holds(anchor)).nonzero()[:, 0]
+        carried = int((kept < carried).sum())
+        gaussians, groups = gaussians.select(kept), groups[kept]
+        anchor, ids = anchor[kept], ids[kept]
+        points = torch.cat([points, liquid.points(frame.particles)])
+        inside = liquid.splats(frame.particles)
+        bare = inside if bare is None else Gaussians.cat([bare, inside])
     things = [rigid_splats(frame.rigid, frame.colliders)]
     things.append(blade_splats(scene, frame.time, ids.device))
     seen = [thing for thing in things if thing is not None]
@@ -284,6 +293,7 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         | {
             "energy": dict(frame.energy),
             "bodies": [[body.name, body.material.name] for body in scene.bodies],
+            "liquid_inside": list(liquid.bodies) if liquid else [],
         },
     )
 

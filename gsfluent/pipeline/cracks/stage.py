@@ -24,6 +24,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.chunks import Chunks
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
+from gsfluent.pipeline.liquid.parts import LiquidParts
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.stage import Stage
 from gsfluent.results.partition import SavedPartition
@@ -164,6 +165,11 @@ class CrackHistory:
     def graph(self) -> CrackGraph:
         """Neighbours of the splats at rest (method ``mvee``)."""
         return CrackGraph(self.carry, self.repair.radius, self.repair.neighbour_radius)
+
+    @functools.cached_property
+    def liquid(self) -> LiquidParts | None:
+        """What of the solids is liquid from the start; None without any."""
+        return LiquidParts.of(self.carry)
 
     def step(self, points: Points) -> Cracks | None:
         """Go on to the next frame (``chunks``, ``gap``): call once per frame, in their order.

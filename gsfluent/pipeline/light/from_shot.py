@@ -184,20 +184,24 @@ def clear_of(frame: SavedFrame) -> Clear | None:
         for _, preset in frame.facts.get("bodies", ())
     ]
     liquids = [made for made in bodies if made is not None and made.law == "fluid"]
-    if not liquids:
+    inside = frame.facts.get("liquid_inside", ())
+    if not liquids and not inside:
         return None
     like = frame.gaussians.means
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()
     flows = torch.tensor([made in liquids for made in bodies], device=like.device)
     clarity = like.new_tensor([1.0 if made is None else made.transmission for made in bodies])
+    # what was inside a solid has its colours, and lets no light through
+    flows[list(inside)], clarity[list(inside)] = True, 0.0
     # those of solids have numbers up from 0, those of the repair too
     rows = (anchor >= 0) & (frame.ids < 0) & flows[body]
+    wet = liquids[0] if liquids else materials.get("water")
     return Clear(
         rows=rows,
         volume=frame.volumes[anchor[rows]],
         attenuation=-100.0 * clarity.log()[body[rows]],
-        gloss=like.new_tensor([liquids[0].specular, liquids[0].shininess]),
+        gloss=like.new_tensor([wet.specular, wet.shininess]),
     )
 
 

@@ -25,6 +25,7 @@ from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.cracks.gaps import Cracks
 from gsfluent.pipeline.cracks.stage import METHODS, CrackHistory, Repair, Repaired
 from gsfluent.pipeline.heat.ladder import thawing
+from gsfluent.pipeline.liquid.parts import LiquidParts
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
 from gsfluent.pipeline.matter.fragments import Fragments
 from gsfluent.pipeline.matter.points import (
@@ -133,6 +134,11 @@ class SimulationFrame:
         return history.repair(
             self._carry, self.motion, self.carried, history=history, cracks=self._cracks
         )
+
+    @property
+    def liquid(self) -> LiquidParts | None:
+        """What of the solids is liquid from the start; None without any."""
+        return self._binding().liquid
 
     @property
     def gaussians(self) -> Gaussians:
