@@ -118,6 +118,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "float[3] low, float cell, int count) -> (Tensor, Tensor)");
   m.def("box_blur(Tensor indicator, int width, int times) -> Tensor");
   m.def("distance_transform(Tensor occupied, bool indices) -> (Tensor, Tensor)");
+  m.def("trilinear(Tensor grid, Tensor place) -> Tensor");
   m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
 
   // --- graph: links between points, what hangs together, the nearest seed along links ---

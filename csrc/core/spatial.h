@@ -312,6 +312,47 @@ struct BoxSumArgs {
   }
 };
 
+// --- between the values of a grid ---
+
+template <typename T>
+struct TrilinearArgs {
+  int64_t count;  // N
+  int64_t shape[3];
+  const T* grid;   // [X, Y, Z]
+  const T* place;  // [N, 3] in steps
+  T* value;        // [N]
+};
+
+// The value at place i; corners outside of the grid have no share.
+template <typename T>
+GSF_INLINE void trilinear(const TrilinearArgs<T>& a, int64_t i) {
+  int64_t corner[3][2];
+  T share[3][2];
+  for (int axis = 0; axis < 3; ++axis) {
+    const T place = a.place[3 * i + axis];
+    // also false for NaN; what is so far out has no neighbours in the grid
+    if (!(place > T(-1e9) && place < T(1e9))) {
+      a.value[i] = place - place;
+      return;
+    }
+    const T base = floor(place), fraction = place - base;
+    for (int end = 0; end < 2; ++end) {
+      corner[axis][end] = int64_t(base) + end;
+      const bool held = corner[axis][end] >= 0 && corner[axis][end] < a.shape[axis];
+      share[axis][end] = held ? (end ? fraction : T(1) - fraction) : T(0);
+    }
+  }
+  T total = T(0);
+  for (int k = 0; k < 8; ++k) {
+    const int x = k >> 2, y = k >> 1 & 1, z = k & 1;
+    const T part = product(product(share[0][x], share[1][y]), share[2][z]);
+    if (part == T(0)) continue;
+    const int64_t at = (corner[0][x] * a.shape[1] + corner[1][y]) * a.shape[2] + corner[2][z];
+    total += product(part, a.grid[at]);
+  }
+  a.value[i] = total;
+}
+
 // --- value noise ---
 
 constexpr int kMostOctaves = 16;

@@ -145,6 +145,13 @@ struct SpatialCpu {
     });
   }
 
+  template <typename T>
+  static void trilinear(const TrilinearArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 2048, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::trilinear(a, i);
+    });
+  }
+
   static void value_noise(const ValueNoiseArgs& a, const Scope&) {
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::value_noise(a, i);

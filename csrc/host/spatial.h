@@ -155,6 +155,24 @@ struct SpatialOps {
     return {squares[1 - turn], sources[1 - turn]};
   }
 
+  static Tensor trilinear(Tensor grid, Tensor place) {
+    const char* op = "trilinear";
+    check_shape(op, "grid", grid, {-1, -1, -1});
+    return dispatch_floating(op, grid, [&]<typename T>() {
+      const Tensor held = ready(op, "grid", grid, grid, {-1, -1, -1});
+      const Tensor places = ready(op, "place", place, grid, {-1, 3});
+      Tensor value = gsf::new_empty(grid, {places.size(0)}, grid.scalar_type());
+      const TrilinearArgs<T> args{places.size(0),
+                                  {held.size(0), held.size(1), held.size(2)},
+                                  cptr<T>(held),
+                                  cptr<T>(places),
+                                  mptr<T>(value)};
+      const typename Backend::Scope scope(held);
+      Backend::trilinear(args, scope);
+      return value;
+    });
+  }
+
   static Tensor value_noise(Tensor voxels, std::vector<double> spacings, std::vector<double> shifts,
                             std::vector<double> weights) {
     const char* op = "value_noise";
@@ -187,6 +205,7 @@ struct SpatialOps {
     GSF_IMPL(SpatialOps, nearest_in_cells);
     GSF_IMPL(SpatialOps, box_blur);
     GSF_IMPL(SpatialOps, distance_transform);
+    GSF_IMPL(SpatialOps, trilinear);
     GSF_IMPL(SpatialOps, value_noise);
   }
 

@@ -38,6 +38,7 @@ __getattr__, __dir__, __all__ = lazy(
             "largest_shares",
             "nearest_in_cells",
             "nearest_labels",
+            "trilinear",
             "value_noise",
         ),
         "gsfluent.ops.graph": ("components", "link_costs", "nearest_seeds"),

@@ -190,6 +190,25 @@ def distance_transform(occupied: Tensor, *, indices: bool = False) -> tuple[Tens
     return torch.ops.gsfluent.distance_transform.default(occupied, indices)
 
 
+def trilinear(grid: Tensor, place: Tensor) -> Tensor:
+    """Values of a grid between its points, trilinear, [N]; corners outside of it count as 0.
+
+    Args:
+        grid: float32 or float64 [X, Y, Z].
+        place: Where [steps], [N, 3], as ``grid``. At NaN and infinities the value is NaN.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none; :func:`gsfluent.geometry.trilinear` has one.
+    """
+    op = "trilinear"
+    check_tensor(op, "grid", grid, shape=("X", "Y", "Z"), dtype=(torch.float32, torch.float64))
+    check_tensor(op, "place", place, shape=("N", 3), dtype=grid.dtype, like=grid)
+    return torch.ops.gsfluent.trilinear.default(grid, place)
+
+
 def value_noise(
     voxels: Tensor, spacings: Sequence[float], shifts: Sequence[float], weights: Sequence[float]
 ) -> Tensor:
@@ -258,10 +277,11 @@ fakes(
         occupied.new_empty(occupied.shape, dtype=torch.int32),
         occupied.new_empty(occupied.shape if indices else (0, 0, 0), dtype=torch.int32),
     ),
+    trilinear=lambda grid, place: grid.new_empty(place.shape[:1]),
     value_noise=lambda voxels, *rest: voxels.new_empty(voxels.shape, dtype=torch.float32),
 )
 no_gradient(
     "spatial: no gradient",
     "nearest_labels", "largest_shares", "nearest_in_cells", "box_blur", "distance_transform",
-    "value_noise",
+    "trilinear", "value_noise",
 )  # fmt: skip

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsfluent import ops
+from gsfluent import geometry, ops
 from gsfluent.ops.reference import spatial as reference
 from gsfluent.spatial.neighbours import grid_search
 
@@ -235,3 +235,33 @@ def test_distances_say_what_is_wrong() -> None:
     held = torch.ones(4, 3, 5, dtype=torch.bool)
     for indices in (False, True):
         torch.library.opcheck(torch.ops.gsfluent.distance_transform.default, (held, indices))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_values_between_those_of_a_grid(device: str, dtype: torch.dtype) -> None:
+    grid = torch.randn(SHAPE, generator=draw(4), dtype=dtype)
+    size = torch.tensor(SHAPE)
+    place = torch.rand(5000, 3, generator=draw(5), dtype=dtype) * (size + 4) - 2.5
+    place[:200] = place[:200].round()
+    place[200:205] = torch.tensor([-1.0, -0.5, 1e8, -1e8, 3e9], dtype=dtype)[:, None]
+    wanted = geometry.trilinear(grid, place)
+    got = ops.trilinear(grid.to(device), place.to(device)).cpu()
+    assert torch.equal(got, wanted)  # rounded alike
+    nowhere = torch.full((3, 3), 1.0, dtype=dtype)
+    nowhere[0, 1], nowhere[1, 2], nowhere[2, 0] = torch.nan, torch.inf, -torch.inf
+    assert bool(ops.trilinear(grid.to(device), nowhere.to(device)).isnan().all())
+    assert ops.trilinear(grid.to(device), place[:0].to(device)).shape == (0,)
+    empty = ops.trilinear(grid[:0].to(device), place.nan_to_num().to(device)).cpu()
+    assert torch.equal(empty, torch.zeros_like(empty))
+
+
+def test_trilinear_says_what_is_wrong() -> None:
+    grid, place = torch.zeros(3, 4, 5), torch.zeros(2, 3)
+    with pytest.raises(TypeError, match="grid"):
+        ops.trilinear(grid.long(), place)
+    with pytest.raises(TypeError, match="place"):
+        ops.trilinear(grid, place.double())
+    with pytest.raises(ValueError, match="place"):
+        ops.trilinear(grid, place[:, :2])
+    torch.library.opcheck(torch.ops.gsfluent.trilinear.default, (grid, place))

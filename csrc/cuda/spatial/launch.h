@@ -13,6 +13,8 @@ cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream);
 cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream);
 cudaError_t box_sum(const BoxSumArgs& a, cudaStream_t stream);
 cudaError_t distance_pass(const DistanceArgs& a, cudaStream_t stream);
+template <typename T>
+cudaError_t trilinear(const TrilinearArgs<T>& a, cudaStream_t stream);
 cudaError_t value_noise(const ValueNoiseArgs& a, cudaStream_t stream);
 
 }  // namespace gsf::cuda

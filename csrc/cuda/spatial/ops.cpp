@@ -13,6 +13,7 @@ struct SpatialCuda {
   GSF_LAUNCH(nearest_in_cells)
   GSF_LAUNCH(box_sum)
   GSF_LAUNCH(distance_pass)
+  GSF_LAUNCH(trilinear)
   GSF_LAUNCH(value_noise)
 };
 

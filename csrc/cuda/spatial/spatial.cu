@@ -136,6 +136,12 @@ __global__ void distance_pass_kernel(DistanceArgs a, int64_t lines) {
                  a.next_source ? a.next_source + base : nullptr);
 }
 
+template <typename T>
+__global__ void trilinear_kernel(TrilinearArgs<T> a) {
+  const int64_t i = thread_number();
+  if (i < a.count) gsf::trilinear(a, i);
+}
+
 __global__ void value_noise_kernel(ValueNoiseArgs a) {
   const int64_t i = thread_number();
   if (i < a.count) gsf::value_noise(a, i);
@@ -171,6 +177,14 @@ cudaError_t distance_pass(const DistanceArgs& a, cudaStream_t stream) {
   distance_pass_kernel<<<blocks_for(lines), kThreads, 0, stream>>>(a, lines);
   return cudaGetLastError();
 }
+
+template <typename T>
+cudaError_t trilinear(const TrilinearArgs<T>& a, cudaStream_t stream) {
+  if (a.count) trilinear_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);
+  return cudaGetLastError();
+}
+template cudaError_t trilinear(const TrilinearArgs<float>&, cudaStream_t);
+template cudaError_t trilinear(const TrilinearArgs<double>&, cudaStream_t);
 
 cudaError_t value_noise(const ValueNoiseArgs& a, cudaStream_t stream) {
   if (a.count) value_noise_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from gsfluent.data import Capture, View
 from gsfluent.errors import InputError
-from gsfluent.geometry import trilinear
+from gsfluent.ops.spatial import trilinear
 from gsfluent.pipeline.capture.views import TrainView
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform, surface

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsfluent import ops
 from gsfluent.data import Frame, Solid
-from gsfluent.geometry import trilinear
+from gsfluent.ops.spatial import trilinear
 from gsfluent.pipeline.partition.blur import box_width, reach
 from gsfluent.pipeline.partition.splits import Split
 from gsfluent.pipeline.partition.threshold import (

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.data import Solid
-from gsfluent.geometry import trilinear
+from gsfluent.ops.spatial import trilinear
 from gsfluent.spatial.density import GridBox
 from gsfluent.spatial.voxels import distance_transform
 
