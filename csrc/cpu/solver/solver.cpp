@@ -200,7 +200,7 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
 
 struct Cpu {
   using Scope = CpuScope;
-  static constexpr bool kRanks = true;
+  static constexpr bool kHasRanks = true;
 
   template <typename T>
   static void prime(const SolverView<T>& s, int laws, const Scope&) {
