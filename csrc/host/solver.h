@@ -304,7 +304,7 @@ struct SolverOps {
   static void register_all(Library& m) {
     GSF_IMPL(SolverOps, solver_prime);
     GSF_IMPL(SolverOps, solver_run);
-    if constexpr (Backend::kRanks) GSF_IMPL(SolverOps, solver_ranks);
+    if constexpr (Backend::kHasRanks) GSF_IMPL(SolverOps, solver_ranks);
   }
 
  private:

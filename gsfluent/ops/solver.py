@@ -248,7 +248,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
-        self.ranks = self._ranks(ranks, objects)
+        self.ranks = self._ranks(ranks)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -351,7 +351,7 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(self, ranks: int, objects: Tensor | None) -> int:
+    def _ranks(self, ranks: int) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
         if type(ranks) is not int or not 1 <= ranks <= MOST_RANKS:
             raise InputError(
@@ -361,7 +361,6 @@ class Solver(SolverState):
         unknown = {
             f"device {self.device.type}": self.device.type != "cpu",
             "law phase_field (9)": self._law_set == DAMAGE_FIELD,
-            "objects": objects is not None,
         }
         found = [name for name, used in unknown.items() if used]
         if ranks > 1 and found:

@@ -43,10 +43,63 @@ class TouchPlan {
   T* sums() { return push_.data(); }
   const T* sums() const { return push_.data(); }
 
+  // A point that could touch another body.
+  struct Item {
+    int32_t point, home, next;  // next: of its cell; home: -1 for points of another rank
+    bool pushed;
+    double x[3], v[3];  // place in cells and velocity in cells per second
+    TouchMatter matter;
+    double share;   // of other bodies at which it touches
+    double lag;     // time of the damping [s]
+    double energy;  // V dE/df [Pa cells]
+  };
+  // One on its way to the other ranks.
+  struct Offer {
+    int64_t home;   // its home among those of all
+    uint64_t slot;  // key of the block and field that it is in
+    int32_t rank, local;
+    Item item;
+  };
+
   // What every point gets in the coming step.
   void run() {
     if (!on_) return;
-    collect();
+    clear();
+    collect([&](const Item& item, int32_t slot, int32_t local) { add(item, slot, local); });
+    push();
+  }
+  // The same in one rank of several: what its points are, with the numbers of its homes among those
+  // of all, then what they get from the points of all, in the order of their homes.
+  void offer(int32_t rank, const std::vector<int64_t>& homes, std::vector<Offer>& all) const {
+    if (!on_) return;
+    collect([&](const Item& item, int32_t slot, int32_t local) {
+      const int32_t* b = s_.slot_coord + 4 * int64_t(slot);
+      all.push_back({homes[item.home], block_key(b[0], b[1], b[2], b[3]), rank, local, item});
+    });
+  }
+  void take(int32_t rank, const std::vector<Offer>& all) {
+    if (!on_) return;
+    clear();
+    for (const Offer& offer : all) {
+      const int32_t slot = contact_.slot(offer.slot);
+      if (slot < 0) continue;
+      Item item = offer.item;
+      if (offer.rank != rank) item.home = -1;
+      add(item, slot, offer.local);
+    }
+    push();
+  }
+
+ private:
+  static constexpr int64_t kCellGrain = 32;
+
+  // Cell of a slot with such points.
+  struct Cell {
+    int32_t slot, local;
+    bool meets;
+  };
+
+  void push() {
     const auto each = [&](const auto& f) {
       parallel_for(static_cast<int64_t>(cells_.size()), kCellGrain,
                    [&](int64_t begin, int64_t end) {
@@ -57,38 +110,13 @@ class TouchPlan {
     each([&](Cell& cell, std::vector<int32_t>& others) { find(cell, others); });
     each([&](const Cell& cell, std::vector<int32_t>& others) { push(cell, others); });
     for (const Item& item : items_)
-      if (item.pushed) homes_[item.home] = 1;
+      if (item.pushed && item.home >= 0) homes_[item.home] = 1;
   }
 
- private:
-  static constexpr int64_t kCellGrain = 32;
-
-  // A point that could touch another body.
-  struct Item {
-    int32_t point, home, next;  // next: of its cell
-    bool pushed;
-    double x[3], v[3];  // place in cells and velocity in cells per second
-    TouchMatter matter;
-    double share;   // of other bodies at which it touches
-    double lag;     // time of the damping [s]
-    double energy;  // V dE/df [Pa cells]
-  };
-  // Cell of a slot with such points.
-  struct Cell {
-    int32_t slot, local;
-    bool meets;
-  };
-
-  // The points near blocks that fields share, cell by cell. Every list is in the order in which
-  // points are stored, which is one of their places and state.
-  void collect() {
-    for (const Cell& cell : cells_) first_[int64_t(cell.slot) * kBlockNodes + cell.local] = -1;
-    for (const Item& item : items_) {
-      std::fill_n(given_.data() + 4 * int64_t(item.point), 4, T(0));
-      homes_[item.home] = 0;
-    }
-    cells_.clear();
-    items_.clear();
+  // The points near blocks that fields share, as f(item, slot, cell of it). They come in the order
+  // in which points are stored, which is one of their places and state.
+  template <typename F>
+  void collect(const F& f) const {
     const double dx = double(s_.dx);
     const HomeList<T>& list = s_.homes();
     for (int64_t h = 0; h < s_.clock->homes; ++h) {
@@ -118,16 +146,29 @@ class TouchPlan {
         item.matter = touch_matter(s_, row, step_);
         item.lag = spring_lag(row_wave(s_, row), dx);
         item.share = touch_share(radius);
-        int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
-        if (first < 0) {
-          cells_.push_back({slot, local, false});
-          place(site_[slot]);
-        }
-        item.next = first;
-        first = static_cast<int32_t>(items_.size());
-        items_.push_back(item);
+        f(item, slot, local);
       }
     }
+  }
+  void clear() {
+    for (const Cell& cell : cells_) first_[int64_t(cell.slot) * kBlockNodes + cell.local] = -1;
+    for (const Item& item : items_) {
+      if (item.home < 0) continue;
+      std::fill_n(given_.data() + 4 * int64_t(item.point), 4, T(0));
+      homes_[item.home] = 0;
+    }
+    cells_.clear();
+    items_.clear();
+  }
+  void add(Item item, int32_t slot, int32_t local) {
+    int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
+    if (first < 0) {
+      cells_.push_back({slot, local, false});
+      place(site_[slot]);
+    }
+    item.next = first;
+    first = static_cast<int32_t>(items_.size());
+    items_.push_back(item);
   }
 
   // The sites around one, once.
@@ -196,6 +237,7 @@ class TouchPlan {
     for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
          i = items_[i].next) {
       Item& p = items_[i];
+      if (p.home < 0) continue;
       double sum[3] = {};
       each_near(p, others, [&](const Item& q, const double* d, double r2) {
         const double f = touch_force(p.energy, p.matter.volume, q.energy, q.matter.volume, r2);

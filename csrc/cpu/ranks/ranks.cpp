@@ -149,9 +149,9 @@ void RankCut<T>::share_homes() {
 }
 
 template <typename T>
-bool RankCut<T>::needed(const int32_t* slots) const {
+bool RankCut<T>::any(const int32_t* slots, uint8_t least) const {
   return std::any_of(slots, slots + kSiteFields,
-                     [&](int32_t i) { return slot(i) >= 0 && held_[slot(i)] == kNeeded; });
+                     [&](int32_t i) { return slot(i) >= 0 && held_[slot(i)] >= least; });
 }
 
 // Slots under the windows of a rank's homes, which it needs. Where fields may meet it also holds
@@ -179,9 +179,20 @@ void RankCut<T>::find_held(const Rank<T>& rank) {
     around(s_.homes().coord + 4 * h, [&](int64_t i) {
       if (s_.slot_shared[i] != 0) hold(i);
     });
+  if (s_.object != nullptr)
+    for (const int64_t h : rank.homes)
+      for (int n = 0; n < kNeighbours; ++n) {
+        const int32_t* b = s_.homes().coord + 4 * h;
+        const auto key = [&](int field) {
+          return block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, field);
+        };
+        auto at = std::lower_bound(slot_key_.begin(), slot_key_.end(), key(0));
+        for (; at != slot_key_.end() && *at < key(kMaxSolverFields); ++at)
+          hold(at - slot_key_.begin());
+      }
   for (int64_t i = 0; i < s_.clock->sites; ++i) {
     const int32_t* slots = s_.site_slots + kSiteFields * i;
-    if (!needed(slots)) continue;
+    if (!any(slots, kNeeded)) continue;
     for (int f = 0; f < kSiteFields; ++f) {
       const int32_t here = slot(slots[f]);
       if (here < 0) continue;
@@ -234,10 +245,12 @@ void RankCut<T>::fill(Rank<T>& rank) {
   rank.site_slots.clear();
   for (int64_t i = 0; i < s_.clock->sites; ++i) {
     const int32_t* slots = s_.site_slots + kSiteFields * i;
-    if (!needed(slots)) continue;
+    const bool answers = any(slots, kNeeded) && answered_[i] == 0;
+    // Points look for each other at the sites around them, too.
+    if (!any(slots, s_.object != nullptr ? kHeld : kNeeded)) continue;
     rank.sites.number.push_back(i);
-    rank.sites.answers.push_back(answered_[i] == 0 ? 1 : 0);
-    answered_[i] = 1;
+    rank.sites.answers.push_back(answers ? 1 : 0);
+    if (answers) answered_[i] = 1;
     for (int f = 0; f < kSiteFields; ++f) rank.site_slots.push_back(own(slots[f]));
   }
   rank.neighbour.clear();

@@ -162,8 +162,8 @@ class RankCut {
  private:
   // The slot of all with this number, or -1 for what is none.
   int32_t slot(int32_t number) const { return number < s_.clock->slots ? number : -1; }
-  // Whether the rank at hand needs one of the slots of a site.
-  bool needed(const int32_t* slots) const;
+  // Whether the rank at hand holds one of the slots of a site, or needs it.
+  bool any(const int32_t* slots, uint8_t least) const;
   void share_homes();
   void own_homes(Rank<T>& rank);
   void find_held(const Rank<T>& rank);

@@ -24,10 +24,7 @@ class ContactPlan {
     keys_.resize(c.slots);
     for (int64_t i = 0; i < c.slots; ++i) keys_[i] = key(s_.slot_coord + 4 * i);
     const auto around = [&](const int32_t* b, int n) {
-      const uint64_t wanted =
-          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
-      const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
-      return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+      return slot(block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]));
     };
     for (int64_t i = 0; i < c.slots; ++i) {
       if (s_.slot_shared[i] == 0) continue;
@@ -45,6 +42,12 @@ class ContactPlan {
   bool any() const { return !row_.empty(); }
   // Shared ones of the 27 blocks around home h, as bits.
   uint32_t around_home(int64_t h) const { return any() ? home_[h] : 0; }
+
+  // Slot of a block of a field, or -1; where any() holds.
+  int32_t slot(uint64_t key) const {
+    const auto at = std::lower_bound(keys_.begin(), keys_.end(), key);
+    return at != keys_.end() && *at == key ? static_cast<int32_t>(at - keys_.begin()) : -1;
+  }
 
   // Whether nodes of the stencil at this cell lie in one of these blocks or next to it: those nodes
   // are read where fields meet.

@@ -55,10 +55,10 @@ class HomePass {
     box_.assign(s_.clock->homes, Box{});
   }
 
-  // Adds every particle to the sums of its nodes and marks the slots: what comes first, then the
-  // homes of each colour. A node gets at most one addend from each, so that ranks which share nodes
-  // can agree in between. Particles of homes with nodes that have no slot count as lost.
-  void begin() { touch_.run(); }
+  // Adds the particles of the homes of one colour to the sums of their nodes and marks the slots;
+  // all colours one after the other. A node gets at most one addend from each, so that ranks which
+  // share nodes can agree in between. Particles of homes with nodes that have no slot count as
+  // lost.
   Counts to_nodes(int color, std::vector<uint8_t>& touched) {
     const std::vector<int32_t>& homes = colors_[color];
     return parallel_counts(static_cast<int64_t>(homes.size()), kHomeGrain,

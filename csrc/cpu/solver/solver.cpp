@@ -46,9 +46,9 @@ class Stepper {
     if (flip_) flip_->plan();
   }
 
-  void begin() { homes_.begin(); }
   Counts to_nodes(int color) { return homes_.to_nodes(color, touched_); }
   T* pushes() { return surface_.sums(); }
+  TouchPlan<T>& touch() { return touch_; }
   int64_t nodes() { return nodes_.run(static_cast<T>(s_.clock->dt), touched_); }
   NodePass<T>& given() { return nodes_; }
   FlipPass<T>* flip() { return flip_.get(); }
@@ -111,6 +111,8 @@ class Lockstep {
                 each([&](size_t r) { return own[r].view.moments; }));
     sums_.share(kTouchedPush, 4 * kReal,
                 each([&](size_t r) { return static_cast<void*>(ranks_[r]->pushes()); }));
+    sums_.share(kTouchedPoints, 4 * kReal,
+                each([&](size_t r) { return static_cast<void*>(ranks_[r]->touch().sums()); }));
     if (s_.own == nullptr) return;
     flip_sums_.plan(each([&](size_t r) { return ranks_[r]->flip()->touched(); }));
     flip_sums_.share(kTouchedSums, 4 * sizeof(double),
@@ -120,7 +122,7 @@ class Lockstep {
   void step() {
     SolverClock& c = *s_.clock;
     cut_.begin();
-    for (auto& rank : ranks_) rank->begin();
+    touch();
     Counts all = to_nodes(sums_, [](Stepper<T>& rank, int color) { return rank.to_nodes(color); });
     for (auto& rank : ranks_) c.touched += rank->nodes();
     end_colliders();
@@ -149,6 +151,17 @@ class Lockstep {
       sums.agree();
     }
     return all;
+  }
+  // What points get that other bodies push.
+  void touch() {
+    if (!cut_.several()) return ranks_[0]->touch().run();
+    std::vector<typename TouchPlan<T>::Offer> offers;
+    for (size_t r = 0; r < ranks_.size(); ++r)
+      ranks_[r]->touch().offer(static_cast<int32_t>(r), cut_.ranks()[r].homes, offers);
+    std::stable_sort(offers.begin(), offers.end(),
+                     [](const auto& a, const auto& b) { return a.home < b.home; });
+    for (size_t r = 0; r < ranks_.size(); ++r)
+      ranks_[r]->touch().take(static_cast<int32_t>(r), offers);
   }
   void end_colliders() {
     if (!cut_.several()) return ranks_[0]->given().end_colliders();
@@ -187,7 +200,7 @@ void prime_particles(const SolverView<T>& s, int laws, bool measure) {
 
 struct Cpu {
   using Scope = CpuScope;
-  static constexpr bool kRanks = true;
+  static constexpr bool kHasRanks = true;
 
   template <typename T>
   static void prime(const SolverView<T>& s, int laws, const Scope&) {
@@ -218,8 +231,8 @@ struct Cpu {
   static void run(const SolverView<T>& s, int laws, int64_t rounds, int64_t steps, const Scope&) {
     SolverClock& c = *s.clock;
     if (s.row_count == 0) return;
-    STD_TORCH_CHECK(s.ranks == 1 || (laws != kDamageField && s.object == nullptr),
-                    "solver: several ranks know no phase field and no objects");
+    STD_TORCH_CHECK(s.ranks == 1 || laws != kDamageField,
+                    "solver: several ranks know no phase field");
     Lockstep<T> ranks(s, laws);
     if (may_step(c)) ranks.plan();
     for (int64_t i = 0; i < rounds * steps; ++i) {

@@ -71,7 +71,7 @@ class Round {
 
 struct SolverCuda {
   using Scope = CudaScope;
-  static constexpr bool kRanks = false;
+  static constexpr bool kHasRanks = false;
   template <typename T>
   static void prime(const SolverView<T>& s, int law_set, const Scope& scope) {
     check_cuda("solver_prime", cuda::solver_prime(s, law_set, scope.stream()));

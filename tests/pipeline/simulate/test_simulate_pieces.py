@@ -263,11 +263,15 @@ def test_pieces_are_looked_for_as_often_as_anything_moves(monkeypatch: pytest.Mo
 def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    ends, used = [], set()
+    ends: list[Any] = []
+    used: set[int] = set()
     counted = ops.Solver.counters
-    monkeypatch.setattr(
-        ops.Solver, "counters", lambda solver: used.add(solver.ranks) or counted(solver)
-    )
+
+    def counters(solver: ops.Solver) -> dict[str, float]:
+        used.add(solver.ranks)
+        return counted(solver)
+
+    monkeypatch.setattr(ops.Solver, "counters", counters)
     for ranks in (1, 3):
         monkeypatch.setitem(ops.Solver.__init__.__kwdefaults__, "ranks", ranks)
         *_, last = Simulate(dx=DX, splats=False)(dropped(), fps=20, seconds=0.75)
