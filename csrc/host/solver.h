@@ -65,6 +65,7 @@ enum SolverBuffer : int {
   kSpringRows,
   kPush,
   kPress,
+  kSlotGiven,
   kSolverBuffers
 };
 
@@ -172,6 +173,7 @@ struct SolverOps {
         {"spring_rows", s.row_count + 2, 2, ScalarType::Double, true},
         {"push", c * kBlockNodes, 4, i64, true},
         {"press", c * kBlockNodes, 4, i64, true},
+        {"slot_given", c, 1, i32, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -208,6 +210,7 @@ struct SolverOps {
     comes_with(kOwn, kFreeVelocity);
     comes_with(kContactRadius, kSpringRows);
     comes_with(kContactRadius, kPush);
+    comes_with(kContactRadius, kSlotGiven);
     comes_with(kObject, kContactRadius);
     comes_with(kObject, kPress);
     const bool any_law = ints[kLawSet] != 0;
@@ -270,6 +273,7 @@ struct SolverOps {
     s.spring_rows = static_cast<double*>(any_at(kSpringRows));
     s.push = static_cast<int64_t*>(any_at(kPush));
     s.press = static_cast<int64_t*>(any_at(kPress));
+    s.slot_given = int_at(kSlotGiven);
     return s;
   }
 

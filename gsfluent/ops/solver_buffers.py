@@ -95,6 +95,7 @@ class Buffers:
     spring_rows: Tensor
     push: Tensor
     press: Tensor
+    slot_given: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -136,7 +137,7 @@ class Buffers:
             if self.own.numel():
                 self.free_velocity = torch.zeros_like(self.node_velocity)
             if self.radius.numel():
-                self.push = torch.zeros_like(self.sums)
+                self.push, self.slot_given = torch.zeros_like(self.sums), whole(slots)
             if self.object.numel():
                 self.press = torch.zeros_like(self.sums)
         # Homes and slots share the table with one entry per site; half full at most.
@@ -192,7 +193,7 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(count, dtype=torch.int32)
     values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
     whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut",
-             "object")  # fmt: skip
+             "object", "slot_given")  # fmt: skip
     for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):

@@ -216,6 +216,7 @@ struct SolverView {
   double* spring_rows;  // [rows + 2, 2]
   int64_t* push;        // [S, 64, 4]
   int64_t* press;       // [S, 64, 4]
+  int32_t* slot_given;  // [S] whether any of that is not 0: bit 0 of push, bit 1 of press
 
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {

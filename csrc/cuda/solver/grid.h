@@ -156,25 +156,34 @@ __device__ double given_unit(const SolverView<T>& s, int which) {
   return ldexp(power_above(fmax(bound, 1e-30)), -int(s.clock->unit_bits));
 }
 __device__ inline double read_given(const int64_t* sums, double unit, int64_t node, int c) {
-  return sums == nullptr ? 0.0 : double(sums[4 * node + c]) * unit;
+  return double(sums[4 * node + c]) * unit;
 }
-__device__ inline void clear_given(int64_t* sums, int64_t node) {
-  if (sums == nullptr) return;
-  longlong2* words = reinterpret_cast<longlong2*>(sums + 4 * node);
-  const longlong2 a = words[0], b = words[1];
-  if ((a.x | a.y | b.x | b.y) != 0) words[0] = words[1] = longlong2{0, 0};
-}
+// Bits of SolverView::slot_given.
+constexpr int32_t kPushed = 1 << kPush, kPressed = 1 << kPress;
 
-// Sums of a node with what its points are given.
+// Sums of a node with what its points are given; `given` is that of its slot.
 template <typename T, bool kPoints>
-__device__ __forceinline__ NodeSums<T> read_all(const SolverView<T>& s, int64_t node) {
+__device__ __forceinline__ NodeSums<T> read_all(const SolverView<T>& s, int64_t node,
+                                                int32_t given) {
   NodeSums<T> sums = read_sums(s, node);
   if constexpr (kPoints) {
-    const double push = given_unit(s, kPush), press = given_unit(s, kPress);
-    for (int c = 0; c < 3; ++c)
-      sums.momentum[c] += read_given(s.push, push, node, c) + read_given(s.press, press, node, c);
+    for (const int which : {kPush, kPress}) {
+      if ((given >> which & 1) == 0) continue;
+      const double unit = given_unit(s, which);
+      for (int c = 0; c < 3; ++c)
+        sums.momentum[c] += read_given(which == kPush ? s.push : s.press, unit, node, c);
+    }
   }
   return sums;
+}
+// Clears the latter for the next step.
+template <typename T>
+__device__ void clear_given(const SolverView<T>& s, int64_t node, int32_t given) {
+  for (const int which : {kPush, kPress}) {
+    if ((given >> which & 1) == 0) continue;
+    longlong2* words = reinterpret_cast<longlong2*>((which == kPush ? s.push : s.press) + 4 * node);
+    words[0] = words[1] = longlong2{0, 0};
+  }
 }
 
 // Friction where points of different objects push each other. Out of line, as collide_near.
@@ -288,9 +297,13 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   Vec3<T> velocity[kSiteFields];
   bool heavy[kSiteFields];
   int present = 0;
+  [[maybe_unused]] int32_t given_any = 0;
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
-    heavy[f] = node_velocity(s, read_all<T, kPoints>(s, node), dt, velocity[f]);
+    int32_t given = 0;
+    if constexpr (kPoints) given = s.slot_given[slots[f]];
+    given_any |= given;
+    heavy[f] = node_velocity(s, read_all<T, kPoints>(s, node, given), dt, velocity[f]);
     present += heavy[f] ? 1 : 0;
   }
   int touched = 0;
@@ -299,7 +312,7 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   const auto mass = [&](int f) { return read_sums(s, node_of(f)).mass; };
   if (present > 1) touched = node_contact(s, count, heavy, number, mass, near_nodes, velocity);
   if constexpr (kPoints)
-    if (present > 1 && s.press != nullptr)
+    if (present > 1 && (given_any & kPressed) != 0)
       hold_near(s, count, heavy, number, mass, node_of, velocity);
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
@@ -309,7 +322,8 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
     if constexpr (!kPoints) store_velocity(s.node_velocity, node, velocity[f]);
   }
   if constexpr (kPoints) {
-    if (s.collider_count > 0) rub_near(s, held, count, heavy, number, mass, node_of, x, velocity);
+    if ((given_any & kPushed) != 0)
+      rub_near(s, held, count, heavy, number, mass, node_of, x, velocity);
     for (int f = 0; f < count; ++f) store_velocity(s.node_velocity, node_of(f), velocity[f]);
   }
   if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
@@ -338,13 +352,12 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
   const int64_t node = slot * kBlockNodes + local;
   const int32_t shared = s.moments != nullptr ? s.slot_shared[slot] : 0;
   const uint64_t near = s.collider_count > 0 ? s.slot_near[slot] : 0;
-  const NodeSums<T> sums = read_all<T, kPoints>(s, node);
+  int32_t given = 0;
+  if constexpr (kPoints) given = s.slot_given[slot];
+  const NodeSums<T> sums = read_all<T, kPoints>(s, node, given);
   clear_sums(s, node, shared);
   if (shared == 1) {
-    if constexpr (kPoints) {
-      clear_given(s.push, node);
-      clear_given(s.press, node);
-    }
+    if constexpr (kPoints) clear_given(s, node, given);
     return;
   }
   Vec3<T> v;
@@ -357,21 +370,20 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
     v = collide_near<T, kPoints>(s, held, near, heavy, x, sums.mass, cut, v, dt);
   }
   if constexpr (kPoints) {
-    if (s.collider_count > 0) {
+    if ((given & kPushed) != 0) {
       const Vec3<T> x =
           node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
       const auto number = [&](int) { return s.slot_coord[4 * slot + 3]; };
       const auto mass = [&](int) { return sums.mass; };
       rub_near(s, held, 1, &heavy, number, mass, [&](int) { return node; }, x, &v);
     }
-    clear_given(s.push, node);
-    clear_given(s.press, node);
+    clear_given(s, node, given);
   }
   store_velocity(s.node_velocity, node, v);
 }
 
 template <typename T, bool kPoints>
-__global__ void __launch_bounds__(kSolverThreads, kPoints ? 2 : kGridCtas)
+__global__ void __launch_bounds__(kSolverThreads, kGridCtas)
     grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;

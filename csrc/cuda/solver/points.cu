@@ -128,9 +128,15 @@ __device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, Gi
     int i, j, k;
     const int at = window_node(index, i, j, k);
     const int64_t node = slot_node(window.neighbour, i, j, k);
-    for (int c = 0; c < 4 && node >= 0; ++c)
-      if (window.sums[c][at] != 0)
-        add_units(out + 4 * node + c, static_cast<long long>(window.sums[c][at]));
+    bool any = false;
+    for (int c = 0; c < 4 && node >= 0; ++c) {
+      if (window.sums[c][at] == 0) continue;
+      add_units(out + 4 * node + c, static_cast<long long>(window.sums[c][at]));
+      any = true;
+    }
+    int32_t* note = s.slot_given + node / kBlockNodes;
+    if (any && (*static_cast<volatile int32_t*>(note) >> which & 1) == 0)
+      atomicOr(note, 1 << which);
   }
 }
 
@@ -178,7 +184,7 @@ __global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ 
       const int64_t first = __ffsll(static_cast<long long>(left)) - 1;
       const int64_t end = first == 63 ? s.collider_count : first + 1;
       for (int64_t k = first; k < end; ++k)
-        if (pushes_points(s, k)) push_point(s, k, point, longest, given);
+        if (k < 63 || pushes_points(s, k)) push_point(s, k, point, longest, given);
     }
     const Vec3<T> j{given[0], given[1], given[2]};
     given[3] = T(fmin(double(given[3]), kFrictionMost * double(norm(j))));
@@ -252,41 +258,78 @@ __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ 
   });
 }
 
-// A point that looks for those of other objects.
-template <typename T>
-struct Seeker {
-  T offset[3], velocity[3];
-  uint32_t meta;
-  int32_t field;
+// What a home's kernels need of the blocks around it.
+struct Around {
+  int32_t neighbour[kNeighbours];
+  bool shared[kNeighbours];
+  // slots of other objects in each block, and cells of the window that hold points of these, from
+  // one before its first node
+  int32_t others[kNeighbours], other[kNeighbours][kSiteFields];
+  bool filled[kWindowNodes];
+
+  // Whole CTAs together; false when no point of another object is near.
+  template <typename T>
+  __device__ bool load(const SolverView<T>& s, int64_t home) {
+    load_slots(s, home, neighbour);
+    __syncthreads();
+    load_shared(s, neighbour, shared);
+    if (threadIdx.x < kNeighbours) {
+      const int32_t* c = s.homes().coord + 4 * home;
+      const int n = threadIdx.x;
+      const int32_t e = find(
+          s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, kMaxSolverFields));
+      int32_t slot = e >= 0 ? s.table_slot[e] : -1;
+      int count = 0;
+      for (int f = 0; f < kSiteFields && slot >= 0 && slot < s.slot_capacity; ++f) {
+        if (s.touches_by_points(c[3], s.slot_coord[4 * int64_t(slot) + 3]))
+          other[n][count++] = slot;
+        slot = s.slot_next[slot];
+      }
+      others[n] = count;
+    }
+    __syncthreads();
+    bool any = false;
+    for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
+      const int at[3] = {index / 64 - 1, index / 8 % 8 - 1, index % 8 - 1};
+      bool here = false;
+      for_cell(at, [&](int64_t node) { here = here || *cell_head(s, node) != 0; });
+      filled[index] = here;
+      any = any || here;
+    }
+    return __syncthreads_or(any) != 0;
+  }
+  // Calls f(node) for the slots of other objects at a cell of the window, from -1 to 6.
+  template <typename F>
+  __device__ void for_cell(const int* at, const F& f) const {
+    const int block = neighbour_of(at[0], at[1], at[2]);
+    const int there = local_index(window_local(at[0]), window_local(at[1]), window_local(at[2]));
+    for (int i = 0; i < others[block]; ++i) f(int64_t(other[block][i]) * kBlockNodes + there);
+  }
 };
 
-// Calls f(q, d, r2) for the points of other objects near one. `heads`: first slot of the site of
-// each of the 27 blocks around the home. The order is any.
+// Calls f(q, d, r2) for the points of other objects near one. The order is any.
 template <typename T, typename F>
-__device__ void for_others(const SolverView<T>& s, const int32_t* heads, const Seeker<T>& p,
-                           const F& f) {
+__device__ void for_others(const SolverView<T>& s, const Around& around, uint32_t meta,
+                           const T* place, const F& f) {
   const int32_t* next = Room<T>(s).next;
   for (int o = 0; o < kNeighbours; ++o) {
-    int at[3];  // in the window, from -1 to 6: the blocks around the home hold -3 to 8
+    int at[3];
     for (int axis = 0; axis < 3; ++axis)
-      at[axis] = min(meta_cell(p.meta, axis), kLastCell) + neighbour_step(o, axis);
-    int32_t slot = heads[neighbour_of(at[0], at[1], at[2])];
-    const int there = local_index(window_local(at[0]), window_local(at[1]), window_local(at[2]));
-    for (int field = 0; field < kSiteFields && slot >= 0 && slot < s.slot_capacity;
-         ++field, slot = s.slot_next[slot]) {
-      if (!s.touches_by_points(p.field, s.slot_coord[4 * int64_t(slot) + 3])) continue;
-      int64_t q = int64_t(*cell_head(s, int64_t(slot) * kBlockNodes + there)) - 1;
+      at[axis] = min(meta_cell(meta, axis), kLastCell) + neighbour_step(o, axis);
+    if (!around.filled[((at[0] + 1) * 8 + at[1] + 1) * 8 + at[2] + 1]) continue;
+    around.for_cell(at, [&](int64_t node) {
+      int64_t q = int64_t(*cell_head(s, node)) - 1;
       for (int64_t tries = 0; q >= 0 && q < s.count && tries < s.count; ++tries, q = next[q]) {
         T offset[3];
         load_place(s, q, offset);
         double d[3], r2 = 0.0;
         for (int axis = 0; axis < 3; ++axis) {
-          d[axis] = double(p.offset[axis]) - double(offset[axis]) - neighbour_step(o, axis);
+          d[axis] = double(place[axis]) - double(offset[axis]) - neighbour_step(o, axis);
           r2 += d[axis] * d[axis];
         }
         if (r2 < kTouchReach * kTouchReach) f(q, d, r2);
       }
-    }
+    });
   }
 }
 
@@ -304,65 +347,44 @@ __device__ inline long long units_of(double value, double per_unit) {
   return __double2ll_rn(value * per_unit);
 }
 
-// What a home's kernels need of the blocks around it.
-struct Around {
-  int32_t neighbour[kNeighbours], heads[kNeighbours];
-  bool shared[kNeighbours];
-
-  // Whole CTAs together.
-  template <typename T>
-  __device__ void load(const SolverView<T>& s, int64_t home) {
-    load_slots(s, home, neighbour);
-    __syncthreads();
-    load_shared(s, neighbour, shared);
-    if (threadIdx.x < kNeighbours) {
-      const int32_t* c = s.homes().coord + 4 * home;
-      const int n = threadIdx.x;
-      const int32_t e = find(
-          s, block_key(c[0] + n / 9 - 1, c[1] + n / 3 % 3 - 1, c[2] + n % 3 - 1, kMaxSolverFields));
-      heads[n] = e >= 0 ? s.table_slot[e] : -1;
-    }
-    __syncthreads();
-  }
-};
-
 // How much of other objects the points find, and the energy that follows.
 template <typename T>
 __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ SolverView<T> s) {
   __shared__ Around around;
   for_shared_homes(s, [&](int64_t home) {
-    around.load(s, home);
+    if (!around.load(s, home)) return;
     const HomeRange<T> range(s, home);
-    const int32_t field = s.homes().coord[4 * home + 3];
     const double dx = double(s.dx);
     const double stiffness_unit = kShareUnit * stiffness_above(s);
     const double rate_unit = kRateUnit / power_above(fmax(longest_step(s), 1e-30));
+    const double per_stiffness = 1.0 / stiffness_unit, per_rate = 1.0 / rate_unit;
     for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
       const int64_t p = range.first + r;
-      Seeker<T> seeker;
-      seeker.meta = load_place(s, p, seeker.offset);
-      if (!may_touch(around.shared, seeker.meta)) continue;
-      load_speed(s, p, seeker.velocity);
-      seeker.field = field;
-      double velocity[3];
-      for (int axis = 0; axis < 3; ++axis) velocity[axis] = double(seeker.velocity[axis]) / dx;
+      T place[3], speed[3];
+      const uint32_t meta = load_place(s, p, place);
+      if (!may_touch(around.shared, meta)) continue;
+      load_speed(s, p, speed);
+      const double velocity[3] = {double(speed[0]) / dx, double(speed[1]) / dx,
+                                  double(speed[2]) / dx};
       long long share = 0, stiffness = 0, rate = 0;
-      for_others(s, around.heads, seeker, [&](int64_t q, const double* d, double r2) {
-        T speed[3];
-        load_speed(s, q, speed);
-        double velocity_q[3];
-        for (int axis = 0; axis < 3; ++axis) velocity_q[axis] = double(speed[axis]) / dx;
+      for_others(s, around, meta, place, [&](int64_t q, const double* d, double r2) {
+        T speed_q[3];
+        load_speed(s, q, speed_q);
+        const double velocity_q[3] = {double(speed_q[0]) / dx, double(speed_q[1]) / dx,
+                                      double(speed_q[2]) / dx};
         TouchFound found{0.0, 0.0, 0.0};
         add_found(matter_of(s, load_meta(s, q)), d, r2, velocity, velocity_q, found);
         share += units_of(found.share, 1.0 / kShareUnit);
-        stiffness += units_of(found.stiffness, 1.0 / stiffness_unit);
-        rate += units_of(found.rate, 1.0 / rate_unit);
+        stiffness += units_of(found.stiffness, per_stiffness);
+        rate += units_of(found.rate, per_rate);
       });
       const TouchFound sum{double(share) * kShareUnit, double(stiffness) * stiffness_unit,
                            double(rate) * rate_unit};
-      Room<T>(s).energy[p] =
-          touch_energy(matter_of(s, seeker.meta), touch_share(radius_of(s, p) / dx),
-                       spring_lag(row_wave(s, s.row_of(seeker.meta)), dx), sum);
+      double energy = 0.0;
+      if (share != 0)
+        energy = touch_energy(matter_of(s, meta), touch_share(radius_of(s, p) / dx),
+                              spring_lag(row_wave(s, s.row_of(meta)), dx), sum);
+      Room<T>(s).energy[p] = energy;
     }
   });
 }
@@ -372,26 +394,27 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads) press_kernel(const __grid_constant__ SolverView<T> s) {
   __shared__ Around around;
   for_shared_homes(s, [&](int64_t home) {
-    around.load(s, home);
-    const HomeRange<T> range(s, home);
     const Room<T> room(s);
-    const int32_t field = s.homes().coord[4 * home + 3];
-    const double unit = kShareUnit * stiffness_above(s);
+    if (!around.load(s, home)) {
+      if (threadIdx.x == 0) room.filled[home] = 0;
+      return;
+    }
+    const HomeRange<T> range(s, home);
+    const double unit = kShareUnit * stiffness_above(s), per_unit = 1.0 / unit;
     float most = 0.0f;
     for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
       const int64_t p = range.first + r;
-      Seeker<T> seeker;
-      seeker.meta = load_place(s, p, seeker.offset);
-      seeker.field = field;
+      T place[3];
+      const uint32_t meta = load_place(s, p, place);
       long long units[3] = {0, 0, 0};
-      if (may_touch(around.shared, seeker.meta)) {
-        const double energy = room.energy[p], volume = matter_of(s, seeker.meta).volume;
-        for_others(s, around.heads, seeker, [&](int64_t q, const double* d, double r2) {
+      if (may_touch(around.shared, meta)) {
+        const double energy = room.energy[p], volume = matter_of(s, meta).volume;
+        for_others(s, around, meta, place, [&](int64_t q, const double* d, double r2) {
           const double energy_q = room.energy[q];
           if (energy == 0.0 && energy_q == 0.0) return;
           const double force =
               touch_force(energy, volume, energy_q, matter_of(s, load_meta(s, q)).volume, r2);
-          for (int axis = 0; axis < 3; ++axis) units[axis] += units_of(force * d[axis], 1.0 / unit);
+          for (int axis = 0; axis < 3; ++axis) units[axis] += units_of(force * d[axis], per_unit);
         });
       }
       double sum[3];
@@ -424,6 +447,7 @@ template <typename T>
 void solver_points(const SolverView<T>& s, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
   cudaMemsetAsync(s.spring_rows + 2 * (s.row_count + 1), 0, 2 * sizeof(uint64_t), stream);
+  cudaMemsetAsync(s.slot_given, 0, s.slot_capacity * sizeof *s.slot_given, stream);
   if (s.collider_count > 0) {
     push_kernel<T><<<homes, kThreads, 0, stream>>>(s);
     push_scatter_kernel<T><<<homes, kThreads, 0, stream>>>(s);
