@@ -160,15 +160,15 @@ class TouchPlan {
     cells_.clear();
     items_.clear();
   }
-  void add(Item item, int32_t slot, int32_t local) {
+  void add(const Item& item, int32_t slot, int32_t local) {
     int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
     if (first < 0) {
       cells_.push_back({slot, local, false});
       place(site_[slot]);
     }
-    item.next = first;
-    first = static_cast<int32_t>(items_.size());
     items_.push_back(item);
+    items_.back().next = first;
+    first = static_cast<int32_t>(items_.size()) - 1;
   }
 
   // The sites around one, once.
