@@ -8,5 +8,6 @@ __getattr__, __dir__, __all__ = room(
     "surface_normals",
     looks="Liquids",
     nozzle="WAITING pours",
+    parts="LiquidParts",
     sheet="CLOSED ellipsoids",
 )
