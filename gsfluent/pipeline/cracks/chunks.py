@@ -34,7 +34,7 @@ from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
 from gsfluent.pipeline.cracks.followers import WIDE, Followers, Lent, chips, motions, neighbours
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
-from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn
+from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn, flows_at
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
 from gsfluent.pipeline.matter.points import body_frame
@@ -299,22 +299,21 @@ class Chunks:
         here, cuts = find_cuts(partition, seen, splats, rows, of)
         self._region = self._region.index_copy(0, rows, here)
         owner, means = self._owner[rows], splats.means[rows]
-        wrong = (self._chunk[owner] != here).nonzero()[:, 0]
+        # what follows a liquid stays with it
+        wrong = ((self._chunk[owner] != here) & self._may[owner]).nonzero()[:, 0]
         owner[wrong] = sides.own(means[wrong], here[wrong])
         self._owner = self._owner.index_copy(0, rows, owner)
         self._burn(rows[sides.ash[here]], sides)
         high = relief(self._scene.bodies[body].material.name)
         made = find_faces(partition, seen, solid, numbers, high)
-        made = made.select(~sides.ash[made.region])
+        wet = flows_at(made.means, body, self._may, matter)
+        made = made.select(~(sides.ash[made.region] | wet))
         cuts = wide_cuts(splats, rows, here, cuts, made, matter.spacing[body])
         cuts = ChunkCuts(*(part[~sides.ash[self._region[cuts.splat]]] for part in cuts))
         rival = sides.across(splats.means[cuts.splat], cuts.beyond)
         self._cuts.append(cuts._replace(rival=rival))
-        made = dataclasses.replace(
-            made,
-            owner=sides.own(made.means, made.region),
-            rival=sides.across(made.means, made.beyond),
-        )
+        owner, rival = sides.own(made.means, made.region), sides.across(made.means, made.beyond)
+        made = dataclasses.replace(made, owner=owner, rival=rival)
         old = [] if self._faces is None else [self._faces]
         self._faces = ChunkFaces.joined([*old, made])
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from gsfluent.pipeline.matter.fragments import ranked
+from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.partition.threshold import CHIP
-from gsfluent.spatial.neighbours import nearest_in_group
+from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
 
 PART = 3
 """Points of a piece in a region for which that is divided; a chip may lie across two."""
@@ -184,3 +185,19 @@ class Sides:
             return rows[:0]
         near = nearest_in_group(self._rest[rows], group, places, wanted, 1, self._cell)[1][:, 0]
         return torch.where(near < 0, near, rows[near.clamp(min=0)]) if len(rows) else near
+
+
+def flows_at(places: Tensor, body: int, firm: Tensor, matter: Matter) -> Tensor:
+    """Whether places at rest lie in what flows, which has no faces, bool [P].
+
+    Args:
+        places: In a body [m], [P, 3].
+        body: Its number.
+        firm: Points that do not flow, bool [N].
+        matter: The material points.
+    """
+    start, end = matter.ranges[body]
+    if bool(firm[start:end].all()):
+        return torch.zeros_like(places[:, 0], dtype=torch.bool)
+    near = nearest_rows(matter.rest[start:end], places, 1, matter.spacing[body])[1][:, 0]
+    return ~firm[start + near]

@@ -8,6 +8,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import materials
 from gsfluent.pipeline import Simulate
+from gsfluent.pipeline.cracks.torn import flows_at
 from gsfluent.pipeline.light.from_shot import clear_of
 from gsfluent.pipeline.simulate.stage import SimulationFrame
 from gsfluent.scene.scene import Scene
@@ -61,3 +62,11 @@ def test_a_solid_without_a_liquid_stays_as_it_is() -> None:
     assert kept.facts["liquid_inside"] == []
     assert clear_of(kept) is None
     assert kept.carried == frames[-1].carried.count
+
+
+def test_no_face_is_looked_for_in_what_flows() -> None:
+    for parts, wet in (([WHITE], True), ([], False)):
+        matter = fallen("cpu", parts)[1][0]._binding().carry.matter
+        firm = ~matter.of_law("fluid", "drucker_prager")
+        assert bool((~firm).any()) == wet
+        assert torch.equal(flows_at(matter.rest, 0, firm, matter), ~firm)
