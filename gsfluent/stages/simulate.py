@@ -246,7 +246,7 @@ def saved(frame: SimulationFrame, scene: Scene) -> SavedFrame:
         carried = int((kept < carried).sum())
         gaussians, groups = gaussians.select(kept), groups[kept]
         anchor, ids = anchor[kept], ids[kept]
-        points = torch.cat([points, liquid.points(frame.particles)])
+        points = torch.cat([points, liquid.rows])
         inside = liquid.splats(frame.particles)
         bare = inside if bare is None else Gaussians.cat([bare, inside])
     things = [rigid_splats(frame.rigid, frame.colliders)]

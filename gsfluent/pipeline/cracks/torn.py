@@ -8,10 +8,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent.pipeline.matter.carry import nearest_points
 from gsfluent.pipeline.matter.fragments import ranked
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.partition.threshold import CHIP
-from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
+from gsfluent.spatial.neighbours import nearest_in_group
 
 PART = 3
 """Points of a piece in a region for which that is divided; a chip may lie across two."""
@@ -199,5 +200,5 @@ def flows_at(places: Tensor, body: int, firm: Tensor, matter: Matter) -> Tensor:
     start, end = matter.ranges[body]
     if bool(firm[start:end].all()):
         return torch.zeros_like(places[:, 0], dtype=torch.bool)
-    near = nearest_rows(matter.rest[start:end], places, 1, matter.spacing[body])[1][:, 0]
-    return ~firm[start + near]
+    own = torch.full_like(places[:, 0], body, dtype=torch.int64)
+    return ~firm[nearest_points(places, own, matter)]

@@ -71,7 +71,7 @@ class LiquidParts:
         return torch.isin(anchor.long(), self.rows)
 
     def splats(self, particles: Particles) -> Gaussians:
-        """One splat for each of the points as they are now."""
+        """One splat for each of :attr:`rows`, as the points are now: bodies follow each other."""
         made = []
         body = particles.body[self.rows]
         for number in self.bodies:
@@ -84,8 +84,3 @@ class LiquidParts:
             )  # fmt: skip
             made.append(splats.replace(quats=drawn.quats))
         return Gaussians.cat(made)
-
-    def points(self, particles: Particles) -> Tensor:
-        """Point of each of :meth:`splats`, int64 [M]."""
-        body = particles.body[self.rows]
-        return torch.cat([self.rows[body == number] for number in self.bodies])
