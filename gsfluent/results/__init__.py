@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    behind="Behind",
+    behind="Behind held_here",
     digests="Journal require_intact",
     frames=(
         "DUST SavedFrame count_frames frame_head frame_path frame_positions frame_rate "

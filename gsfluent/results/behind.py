@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 from typing import Any
+
+import torch
 
 ROOM = 2
 """What may wait, files for example; more would be held in memory."""
@@ -19,12 +23,20 @@ class Behind:
     undone. Leaving the ``with`` block waits for all that was given; an error of the block itself
     comes first.
 
+    On a GPU the thread has a stream of its own: on a common one each would wait for what the other
+    has begun whenever it reads a number. What it is given is finished before it begins, and what it
+    does is finished before it drops what it was given. Tensors that it keeps for longer are for
+    :func:`held_here`.
+
     Args:
         room: How much may wait, what is being done among it.
+        device: Where it computes; None or a CPU needs nothing.
     """
 
-    def __init__(self, room: int = ROOM) -> None:
+    def __init__(self, room: int = ROOM, device: torch.device | None = None) -> None:
         self._room, self._failed = room, False
+        on_gpu = device is not None and device.type == "cuda"
+        self._stream = torch.cuda.Stream(device) if on_gpu else None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gsfluent-behind")
         self._given: deque[Future[Any]] = deque()
 
@@ -46,13 +58,29 @@ class Behind:
             Exception: What went wrong with something given before.
         """
         self._settle(self._room - 1)
-        self._given.append(self._pool.submit(self._one, work, *given))
+        ready = None
+        if self._stream is not None:
+            ready = torch.cuda.current_stream(self._stream.device).record_event()
+        self._given.append(self._pool.submit(self._one, ready, work, *given))
 
-    def _one(self, work: Callable[..., Any], *given: Any) -> None:
+    @contextlib.contextmanager
+    def _own_stream(self, ready: torch.cuda.Event | None) -> Iterator[None]:
+        if self._stream is None or ready is None:
+            yield
+            return
+        with torch.cuda.stream(self._stream):
+            self._stream.wait_event(ready)
+            try:
+                yield
+            finally:
+                self._stream.synchronize()
+
+    def _one(self, ready: torch.cuda.Event | None, work: Callable[..., Any], *given: Any) -> None:
         if self._failed:
             return
         try:
-            work(*given)
+            with self._own_stream(ready):
+                work(*given)
         except BaseException:
             self._failed = True
             raise
@@ -68,3 +96,19 @@ class Behind:
     def _settle(self, most: int) -> None:
         while len(self._given) > most:
             self._given.popleft().result()
+
+
+def held_here(*values: Any) -> None:
+    """Let tensors made on another stream be kept by the present one for as long as it likes.
+
+    Their memory is not used again before this stream is done with it. Tuples and dataclasses are
+    looked through; tensors on a CPU need nothing.
+    """
+    for value in values:
+        if torch.is_tensor(value):
+            if value.is_cuda:
+                value.record_stream(torch.cuda.current_stream(value.device))
+        elif isinstance(value, tuple):
+            held_here(*value)
+        elif dataclasses.is_dataclass(value):
+            held_here(*(getattr(value, field.name) for field in dataclasses.fields(value)))

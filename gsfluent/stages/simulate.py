@@ -210,7 +210,7 @@ def simulate_stage(context: RunContext) -> None:
                 cost = saved_at - begun
 
         with Behind() as files:
-            with Behind(AHEAD) as repair:
+            with Behind(AHEAD, frames.run.matter.particles.device) as repair:
                 while (moment := frames.advance()) is not None:
                     repair.do(finish, moment)
             keep(ended=True)

@@ -15,7 +15,7 @@ import torch
 from gsfluent.data import INTERIOR, TRANSITION, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.render.video import to_bytes, write_video
-from gsfluent.results.behind import Behind
+from gsfluent.results.behind import Behind, held_here
 from gsfluent.results.digests import file_digest
 from gsfluent.results.frames import SavedFrame, count_frames, load_frame, save_frame
 from gsfluent.results.record import RunRecord
@@ -284,3 +284,20 @@ def test_what_is_written_behind_the_work_keeps_its_order_and_its_errors() -> Non
         for number in (5, 3, 6):
             behind.do(write, number)
     assert done == [0, 1, 2, 4, 5]
+
+
+@pytest.mark.cuda
+def test_what_is_done_behind_has_a_stream_of_its_own_and_finds_what_it_is_given() -> None:
+    device, streams, sums = torch.device("cuda"), [], []
+
+    def read(values: torch.Tensor) -> None:
+        held_here((values, None))
+        streams.append(torch.cuda.current_stream(device))
+        sums.append(float(values.sum()))
+
+    with Behind(3, device) as behind:
+        for number in range(4):
+            torch.cuda._sleep(20_000_000)  # so that the values are not there yet
+            behind.do(read, torch.full((1 << 20,), float(number), device=device))
+    assert sums == [float(number << 20) for number in range(4)]
+    assert len(set(streams)) == 1 and streams[0] != torch.cuda.current_stream(device)

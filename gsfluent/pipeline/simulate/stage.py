@@ -39,6 +39,7 @@ from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Hook, Run
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
+from gsfluent.results.behind import held_here
 from gsfluent.scene.scene import Scene
 
 _log = logging.getLogger(__name__)
@@ -379,6 +380,7 @@ def moment_of(
 
     @torch.no_grad()
     def wrap() -> SimulationFrame:
+        held_here(tuple(state), pieces, units)
         peak, start, broken = state.peak, matter.particles.alpha, state.ever
         damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
         damage = torch.where(broken, 1.0, torch.where(matter.brittle, damage, 0.0))
