@@ -107,15 +107,15 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "density_normals(Tensor means, Tensor quats, Tensor scales, Tensor values, Tensor frame, "
       "int nodes, Tensor? eye=None) -> Tensor");
 
-  // --- spatial: labels of voxels, the largest of many fields, the nearest points among cells, sums
+  // --- spatial: labels of voxels, the largest of many fields, the nearest points, sums
   // over boxes of voxels, noise ---
   m.def("nearest_labels(Tensor place, Tensor rank, int[3] shape, float radius) -> Tensor");
   m.def(
       "largest_shares(Tensor? place, int[3] shape, Tensor shares, Tensor box) -> "
       "(Tensor, Tensor, Tensor)");
   m.def(
-      "nearest_in_cells(Tensor points, Tensor queries, Tensor order, Tensor start, Tensor keys, "
-      "float[3] low, float cell, int count) -> (Tensor, Tensor)");
+      "nearest_points(Tensor points, Tensor queries, Tensor? group, Tensor? asked, float cell, "
+      "float reach, int count) -> (Tensor, Tensor)");
   m.def("box_blur(Tensor indicator, int width, int times) -> Tensor");
   m.def("distance_transform(Tensor occupied, bool indices) -> (Tensor, Tensor)");
   m.def("trilinear(Tensor grid, Tensor place) -> Tensor");

@@ -1,7 +1,6 @@
 // Questions about points and labels in space: the label of the nearest point of every voxel, the
-// two largest of many fields at a place, the nearest points among cells, sums over boxes of voxels,
-// noise between the nodes of lattices. Their use and every
-// formula: gsfluent/pipeline/partition and gsfluent/spatial/neighbours.py.
+// two largest of many fields at a place, sums over boxes of voxels, noise between the nodes of
+// lattices. Their use and every formula: gsfluent/pipeline/partition.
 //
 // Each number is rounded where torch, asked one operation at a time, rounds it, so that both back
 // ends give the same labels. Floats go through `product` and `sum`: compilers fuse them otherwise.
@@ -197,97 +196,6 @@ GSF_INLINE void settle(const LargestSharesArgs& a, int64_t i, const TwoLargest& 
   a.first[i] = found.first;
   a.second[i] = found.second;
   a.lead[i] = found.one - found.two;
-}
-
-// --- the nearest points ---
-
-constexpr int64_t kCellSide = int64_t(1) << 20;  // cells along an axis that a key can tell apart
-
-struct NearestInCellsArgs {
-  int64_t count, cells, points;  // queries, occupied cells, points
-  const double *point, *query;   // [N, 3], [M, 3]
-  const int64_t* order;          // [N] rows by cell
-  const int64_t* start;          // [cells + 1]
-  const int64_t* key;            // [cells], ascending
-  double low[3], cell;
-  int64_t wanted;  // neighbours of each query
-  double* square;  // [M, wanted], infinite where there are too few
-  int64_t* index;  // [M, wanted]
-};
-
-// Cell of query i, each index one up as in keys; false where it is nowhere.
-GSF_INLINE bool cell_of(const NearestInCellsArgs& a, int64_t i, int64_t* cell) {
-  for (int axis = 0; axis < 3; ++axis) {
-    const double place = (a.query[3 * i + axis] - a.low[axis]) / a.cell;
-    if (!(place > -1.0 && place < double(kCellSide))) return false;
-    cell[axis] = int64_t(place) + 1;
-  }
-  return true;
-}
-
-// First and last of the places in `order` that hold the points of line `line` (0 to 8) of the 27
-// cells: cells that follow each other along z have keys that do.
-GSF_INLINE void line_of(const NearestInCellsArgs& a, const int64_t* cell, int line, int64_t* begin,
-                        int64_t* end) {
-  const int64_t x = cell[0] - 1 + line / 3, y = cell[1] - 1 + line % 3;
-  const int64_t key[2] = {(x * kCellSide + y) * kCellSide + cell[2] - 1,
-                          (x * kCellSide + y) * kCellSide + cell[2] + 2};
-  int64_t at[2];
-  for (int side = 0; side < 2; ++side) {
-    int64_t lo = 0, hi = a.cells;
-    while (lo < hi) {
-      const int64_t middle = (lo + hi) / 2;
-      if (a.key[middle] < key[side])
-        lo = middle + 1;
-      else
-        hi = middle;
-    }
-    at[side] = a.start[lo];
-  }
-  *begin = max(at[0], int64_t(0));
-  *end = min(at[1], a.points);
-}
-
-// Row at a place of `order` and its squared distance from query i; false where there is none.
-GSF_INLINE bool candidate(const NearestInCellsArgs& a, int64_t i, int64_t place, int64_t* row,
-                          double* away) {
-  *row = a.order[place];
-  if (*row < 0 || *row >= a.points) return false;
-  const double *p = a.point + 3 * *row, *q = a.query + 3 * i;
-  const double dx = p[0] - q[0], dy = p[1] - q[1], dz = p[2] - q[2];
-  *away = (product(dx, dx) + product(dy, dy)) + product(dz, dz);
-  return true;
-}
-
-// The list of a query: ascending; of those as near the lower row first.
-struct NearestList {
-  int64_t wanted;
-  double* square;
-  int64_t* index;
-
-  GSF_HOST_DEVICE NearestList(const NearestInCellsArgs& a, int64_t i)
-      : wanted(a.wanted), square(a.square + a.wanted * i), index(a.index + a.wanted * i) {}
-  GSF_HOST_DEVICE void clear() const {
-    for (int64_t k = 0; k < wanted; ++k) {
-      square[k] = HUGE_VAL;
-      index[k] = 0;
-    }
-  }
-  GSF_HOST_DEVICE void take(int64_t row, double away) const {
-    int64_t at = wanted - 1;
-    for (; at > 0; --at) {
-      const double before = square[at - 1];
-      if (before < away || (before == away && index[at - 1] < row)) break;
-      square[at] = before;
-      index[at] = index[at - 1];
-    }
-    square[at] = away;
-    index[at] = row;
-  }
-};
-
-GSF_INLINE bool nearer(double away, int64_t row, double worst, int64_t last) {
-  return away < worst || (away == worst && row < last);
 }
 
 // --- sums over boxes of voxels ---

@@ -2,10 +2,57 @@
 #include "host/spatial.h"
 
 #include <algorithm>
+#include <atomic>
 #include <vector>
 
 namespace gsf {
 namespace {
+
+// The points of every cell one after the other.
+void fill_table(const NearestArgs& a, double edge, int32_t* bucket) {
+  parallel_for(a.points, 4096, [&](int64_t first, int64_t last) {
+    for (int64_t i = first; i < last; ++i) bucket[i] = int32_t(bucket_of_point(a, i, edge));
+  });
+  std::fill(a.count, a.count + a.buckets, 0);
+  for (int64_t i = 0; i < a.points; ++i)
+    if (bucket[i] >= 0) ++a.count[bucket[i]];
+  int32_t used = 0;
+  for (int64_t b = 0; b < a.buckets; ++b) {
+    a.end[b] = used;
+    used += a.count[b];
+  }
+  for (int64_t i = 0; i < a.points; ++i)
+    if (bucket[i] >= 0) a.row[a.end[bucket[i]]++] = int32_t(i);
+}
+
+// Looks for the nearest points of query i; whether it has them.
+bool ask(const NearestArgs& a, int64_t i, double edge, bool last) {
+  const NearestList list(a, i);
+  list.clear();
+  const double* place = a.query + 3 * i;
+  const double reach = a.reach * a.reach * (1.0 + kCellSlack);
+  const double& worst = list.square[a.wanted - 1];
+  bool done = last || !finite_place(place);
+  int64_t middle[3], cell[3];
+  double away;
+  if (cell_at(place, edge, middle))
+    for (int ring = 0; ring <= kNearestRings && !(done && ring); ++ring) {
+      const int side = 2 * ring + 1;
+      for (int number = 0; number < side * side * side; ++number) {
+        if (!cell_of_ring(middle, ring, number, cell) ||
+            square_to_cell(place, cell, edge) > std::min(worst, reach))
+          continue;
+        const int64_t bucket = bucket_of(a, cell, group_of(a.asked, i));
+        for (int32_t k = a.end[bucket] - a.count[bucket]; k < a.end[bucket]; ++k)
+          if (candidate(a, i, a.row[k], cell, edge, worst, list.index[a.wanted - 1], &away))
+            list.take(a.row[k], away);
+      }
+      done = done || settled(a, i, worst, ring * edge * (1.0 - kCellSlack));
+    }
+  a.done[i] = done;
+  if (done) list.finish(a.reach);
+  return done;
+}
 
 struct SpatialCpu {
   using Scope = CpuScope;
@@ -56,23 +103,29 @@ struct SpatialCpu {
     });
   }
 
-  static void nearest_in_cells(const NearestInCellsArgs& a, const Scope&) {
-    parallel_for(a.count, 256, [&](int64_t first, int64_t last) {
-      for (int64_t i = first; i < last; ++i) {
-        const NearestList list(a, i);
-        list.clear();
-        int64_t cell[3], begin, end, row;
-        if (!cell_of(a, i, cell)) continue;
-        double away;
-        for (int line = 0; line < 9; ++line) {
-          line_of(a, cell, line, &begin, &end);
-          for (int64_t k = begin; k < end; ++k)
-            if (candidate(a, i, k, &row, &away) &&
-                nearer(away, row, list.square[a.wanted - 1], list.index[a.wanted - 1]))
-              list.take(row, away);
-        }
+  static void nearest_points(const NearestArgs& a, const Scope&) {
+    for (int k = 0; k < 6; ++k) a.box[k] = ordered(k < 3 ? HUGE_VAL : -HUGE_VAL);
+    for (int64_t i = 0; i < a.points; ++i) {
+      if (!finite_place(a.point + 3 * i)) continue;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int64_t value = ordered(a.point[3 * i + axis]);
+        a.box[axis] = std::min(a.box[axis], value);
+        a.box[axis + 3] = std::max(a.box[axis + 3], value);
       }
-    });
+    }
+    std::fill(a.done, a.done + a.queries, uint8_t(0));
+    std::vector<int32_t> bucket(a.points);
+    bool left = a.queries > 0;
+    for (int level = 0; left && level < kNearestLevels; ++level) {
+      const double edge = level_cell(a, level);
+      fill_table(a, edge, bucket.data());
+      std::atomic<bool> some{false};
+      parallel_for(a.queries, 256, [&](int64_t first, int64_t last) {
+        for (int64_t i = first; i < last; ++i)
+          if (!a.done[i] && !ask(a, i, edge, level == kNearestLevels - 1)) some = true;
+      });
+      left = some;
+    }
   }
 
   static void box_sum(const BoxSumArgs& a, const Scope&) {

@@ -4,6 +4,7 @@
 #include <limits>
 
 #include "core/distance.h"
+#include "core/nearest.h"
 #include "core/spatial.h"
 #include "torch_api.h"
 
@@ -63,38 +64,54 @@ struct SpatialOps {
     return {first, second, lead};
   }
 
-  static std::tuple<Tensor, Tensor> nearest_in_cells(Tensor points, Tensor queries, Tensor order,
-                                                     Tensor start, Tensor keys,
-                                                     std::vector<double> low, double cell,
-                                                     int64_t count) {
-    const char* op = "nearest_in_cells";
+  static std::tuple<Tensor, Tensor> nearest_points(Tensor points, Tensor queries, OptTensor group,
+                                                   OptTensor asked, double cell, double reach,
+                                                   int64_t count) {
+    const char* op = "nearest_points";
     points = ready(op, "points", points, points, {-1, 3}, ScalarType::Double);
     queries = ready(op, "queries", queries, points, {-1, 3}, ScalarType::Double);
-    order = ready(op, "order", order, points, {points.size(0)}, ScalarType::Long);
-    keys = ready(op, "keys", keys, points, {-1}, ScalarType::Long);
-    start = ready(op, "start", start, points, {keys.size(0) + 1}, ScalarType::Long);
-    STD_TORCH_CHECK(low.size() == 3, op, ": low must have 3 values, got ", low.size());
-    STD_TORCH_CHECK(cell > 0, op, ": cell must be positive, got ", cell);
+    group = ready(op, "group", group, points, {points.size(0)}, ScalarType::Long);
+    asked = ready(op, "asked", asked, points, {queries.size(0)}, ScalarType::Long);
+    STD_TORCH_CHECK(bool(group) == bool(asked), op, ": group and asked go together");
+    STD_TORCH_CHECK(cell > 0 && std::isfinite(cell), op, ": cell must be positive, got ", cell);
+    STD_TORCH_CHECK(reach >= 0, op, ": reach must not be negative, got ", reach);
     STD_TORCH_CHECK(count >= 1, op, ": count must be at least 1, got ", count);
-    const std::vector<int64_t> sizes{queries.size(0), count};
-    Tensor square = gsf::new_empty(points, sizes, ScalarType::Double);
-    Tensor index = gsf::new_empty(points, sizes, ScalarType::Long);
-    const NearestInCellsArgs args{queries.size(0),
-                                  keys.size(0),
-                                  points.size(0),
-                                  cptr<double>(points),
-                                  cptr<double>(queries),
-                                  cptr<int64_t>(order),
-                                  cptr<int64_t>(start),
-                                  cptr<int64_t>(keys),
-                                  {low[0], low[1], low[2]},
-                                  cell,
-                                  count,
-                                  mptr<double>(square),
-                                  mptr<int64_t>(index)};
+    STD_TORCH_CHECK(points.size(0) <= (int64_t(1) << 27), op, ": at most 2^27 points, got ",
+                    points.size(0));
+    int64_t buckets = 32;
+    while (buckets < 2 * points.size(0)) buckets *= 2;
+    const auto made = [&](std::vector<int64_t> sizes, ScalarType kind) {
+      return gsf::new_empty(points, sizes, kind);
+    };
+    Tensor box = made({6}, ScalarType::Long), marks = made({2, kNearestLevels}, ScalarType::Long);
+    Tensor table = made({2, buckets}, ScalarType::Int),
+           row = made({points.size(0)}, ScalarType::Int);
+    Tensor done = made({queries.size(0)}, ScalarType::Byte);
+    Tensor distance = made({queries.size(0), count}, ScalarType::Double);
+    Tensor index = made({queries.size(0), count}, ScalarType::Long);
+    auto* left = reinterpret_cast<unsigned long long*>(mptr<int64_t>(marks));
+    const NearestArgs args{points.size(0),
+                           queries.size(0),
+                           count,
+                           buckets,
+                           cptr<double>(points),
+                           cptr<double>(queries),
+                           cptr<int64_t>(group),
+                           cptr<int64_t>(asked),
+                           cell,
+                           reach,
+                           mptr<int64_t>(box),
+                           mptr<int32_t>(table),
+                           mptr<int32_t>(table) + buckets,
+                           mptr<int32_t>(row),
+                           left,
+                           left + kNearestLevels,
+                           mptr<uint8_t>(done),
+                           mptr<double>(distance),
+                           mptr<int64_t>(index)};
     const typename Backend::Scope scope(points);
-    Backend::nearest_in_cells(args, scope);
-    return {square, index};
+    Backend::nearest_points(args, scope);
+    return {distance, index};
   }
 
   static Tensor box_blur(Tensor indicator, int64_t width, int64_t times) {
@@ -202,7 +219,7 @@ struct SpatialOps {
   static void register_all(Library& m) {
     GSF_IMPL(SpatialOps, nearest_labels);
     GSF_IMPL(SpatialOps, largest_shares);
-    GSF_IMPL(SpatialOps, nearest_in_cells);
+    GSF_IMPL(SpatialOps, nearest_points);
     GSF_IMPL(SpatialOps, box_blur);
     GSF_IMPL(SpatialOps, distance_transform);
     GSF_IMPL(SpatialOps, trilinear);

@@ -36,7 +36,7 @@ __getattr__, __dir__, __all__ = lazy(
             "box_blur",
             "distance_transform",
             "largest_shares",
-            "nearest_in_cells",
+            "nearest_points",
             "nearest_labels",
             "trilinear",
             "value_noise",

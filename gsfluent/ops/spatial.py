@@ -82,51 +82,58 @@ def largest_shares(
     return torch.ops.gsfluent.largest_shares.default(place, list(shape), shares, box)
 
 
-def nearest_in_cells(
+def nearest_points(
     points: Tensor,
     queries: Tensor,
-    order: Tensor,
-    start: Tensor,
-    keys: Tensor,
-    low: Sequence[float],
-    cell: float,
     count: int,
+    cell: float,
+    *,
+    group: Tensor | None = None,
+    asked: Tensor | None = None,
+    reach: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
-    """Nearest of the points in the 27 cells around each query.
+    """Nearest points of places.
+
+    Points are found by the hash of their cell. What lies within two cells of a query is asked;
+    queries that have not found enough ask cells four times as wide.
 
     Args:
         points: Where to look, float64 [N, 3], world units.
         queries: float64 [M, 3], world units.
-        order: Rows of the points by cell, int64 [N].
-        start: Where each occupied cell begins in ``order``, and the end, int64 [K + 1].
-        keys: Of the cells, ascending, int64 [K]: ``((x + 1) 2^20 + y + 1) 2^20 + z + 1``.
-        low: Corner of cell (0, 0, 0), world units.
-        cell: Edge of the cells, world units.
         count: Neighbours of each query.
+        cell: Edge of the first cells, about the distance of the neighbours, world units.
+        group: Of each point, int64 [N].
+        asked: Group in which each query looks, int64 [M]; goes with ``group``.
+        reach: Distance beyond which nothing is found, world units.
 
     Returns:
-        Squared distances float64 [M, count], ascending, infinite where there are too few, and rows
-        int64 [M, count], 0 there. Of points as near the lower row comes first.
+        Distances float64 [M, count], ascending, infinite where there are too few, and rows int64
+        [M, count], -1 there. Of points as near the lower row comes first. Points that are not
+        finite are not found, and queries that are not finite find nothing.
 
     Raises:
         TypeError: A tensor has a wrong dtype.
-        ValueError: A shape or device is wrong, ``cell`` or ``count`` is not positive.
+        ValueError: A shape or device is wrong, ``cell`` or ``count`` is not positive, ``reach`` is
+            negative, or one of ``group`` and ``asked`` is missing.
 
     Gradient: none.
     """
-    op = "nearest_in_cells"
+    op = "nearest_points"
     check_tensor(op, "points", points, shape=("N", 3), dtype=torch.float64)
     check_tensor(op, "queries", queries, shape=("M", 3), dtype=torch.float64, like=points)
-    for name, value, size in (
-        ("order", order, points.shape[0]), ("keys", keys, None), ("start", start, len(keys) + 1),
-    ):  # fmt: skip
-        check_tensor(op, name, value, shape=(size,), dtype=torch.int64, like=points)
+    if (group is None) != (asked is None):
+        raise ValueError(f"{op}: group and asked go together")
+    for name, value, size in (("group", group, len(points)), ("asked", asked, len(queries))):
+        if value is not None:
+            check_tensor(op, name, value, shape=(size,), dtype=torch.int64, like=points)
     if not (math.isfinite(cell) and cell > 0.0):
         raise ValueError(f"{op}: cell must be positive, got {cell}")
+    if not reach >= 0.0:
+        raise ValueError(f"{op}: reach must not be negative, got {reach}")
     if count < 1:
         raise ValueError(f"{op}: count must be at least 1, got {count}")
-    return torch.ops.gsfluent.nearest_in_cells.default(
-        points, queries, order, start, keys, [float(v) for v in low], float(cell), count
+    return torch.ops.gsfluent.nearest_points.default(
+        points, queries, group, asked, float(cell), float(reach), count
     )
 
 
@@ -268,7 +275,7 @@ fakes(
         tuple(shape), dtype=torch.int16
     ),
     largest_shares=_three,
-    nearest_in_cells=lambda points, queries, order, start, keys, low, cell, count: (
+    nearest_points=lambda points, queries, group, asked, cell, reach, count: (
         queries.new_empty((queries.shape[0], count)),
         queries.new_empty((queries.shape[0], count), dtype=torch.int64),
     ),
@@ -282,6 +289,6 @@ fakes(
 )
 no_gradient(
     "spatial: no gradient",
-    "nearest_labels", "largest_shares", "nearest_in_cells", "box_blur", "distance_transform",
+    "nearest_labels", "largest_shares", "nearest_points", "box_blur", "distance_transform",
     "trilinear", "value_noise",
 )  # fmt: skip

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.ops.reference import spatial as reference
-from gsfluent.spatial.neighbours import grid_search
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 SHAPE = (11, 9, 14)
@@ -92,48 +91,38 @@ def test_no_fields_and_no_places(device: str) -> None:
     assert [part.shape for part in got] == [(0,)] * 3
 
 
-def celled(points: Tensor, low: Tensor, cell: float) -> tuple[Tensor, Tensor, Tensor]:
-    x, y, z = (((points - low) / cell).long() + 1).unbind(dim=1)
-    key, order = (((x << 20) + y << 20) + z).sort(stable=True)
-    keys, counts = torch.unique_consecutive(key, return_counts=True)
-    return order, torch.cat([counts.new_zeros(1), counts.cumsum(0)]), keys
-
-
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("count", [1, 5, 40])
-def test_the_nearest_points_of_the_cells_around(device: str, count: int) -> None:
-    points = torch.rand(150, 3, generator=draw(4), dtype=torch.float64)
+@pytest.mark.parametrize("count", [1, 5, 40, 200])
+@pytest.mark.parametrize("cell", [1e-300, 0.01, 0.17, 30.0])
+def test_the_nearest_points(device: str, count: int, cell: float) -> None:
+    points = torch.rand(150, 3, generator=draw(4), dtype=torch.float64) - 0.5
     points[:60] = (8.0 * points[:60]).round() / 8.0  # ties, and points in the same place
-    queries = torch.cat([points[:40], torch.rand(40, 3, generator=draw(5), dtype=torch.float64)])
-    low, cell = torch.zeros(3, dtype=torch.float64), 0.17
-    parts = [part.to(device) for part in (points, queries, *celled(points, low, cell))]
-    got = ops.nearest_in_cells(*parts, low.tolist(), cell, count)
-    same(got, reference.nearest_in_cells(points, queries, low.tolist(), cell, count))
+    queries = 3.0 * torch.rand(40, 3, generator=draw(5), dtype=torch.float64) - 1.0
+    queries = torch.cat([points[:40], queries, 1e9 * queries[:5]])
+    given = [x.to(device) for x in (points, queries)]
+    same(ops.nearest_points(*given, count, cell), reference.nearest_points(points, queries, count))
+    group, asked = torch.arange(150) % 7 - 2, torch.arange(85) % 9 - 3
+    some = {"group": group, "asked": asked, "reach": 0.6}
+    there = {k: v.to(device) if torch.is_tensor(v) else v for k, v in some.items()}
+    got = ops.nearest_points(*given, count, cell, **there)
+    wanted = reference.nearest_points(points, queries, count, **some)
+    assert bool((wanted[1] >= 0).any()) and bool((wanted[1] < 0).any())
+    same(got, wanted)
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_rows_that_are_none_are_left_out(device: str) -> None:
-    """Whatever the tensors of the cells hold, nothing is read beyond the points."""
-    points = torch.rand(20, 3, generator=draw(6), dtype=torch.float64)
-    order, start, keys = celled(points, torch.zeros(3, dtype=torch.float64), 0.5)
-    order[3], order[7], start[-1] = 1 << 40, -5, 1 << 50
-    parts = [part.to(device) for part in (points, points, order, start, keys)]
-    square, rows = ops.nearest_in_cells(*parts, [0.0, 0.0, 0.0], 0.5, 30)
-    assert bool(((rows >= 0) & (rows < 20)).all())
-    assert int(square.isinf().sum()) >= 20 * 12
-    far = torch.tensor([[torch.nan, 0.0, 0.0], [-9e9, 0.0, 0.0], [1e300, 0.0, 0.0]])
-    parts[1] = far.double().to(device)
-    assert bool(ops.nearest_in_cells(*parts, [0.0, 0.0, 0.0], 0.5, 2)[0].isinf().all())
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_search_by_cells_finds_what_a_table_finds(device: str) -> None:
-    points = torch.rand(200, 3, generator=draw(7), dtype=torch.float64)
-    queries = 3.0 * torch.rand(60, 3, generator=draw(8), dtype=torch.float64) - 1.0
-    distance, rows = grid_search(points.to(device), queries.to(device), 4, 0.01)
-    wanted, expected = torch.cdist(queries, points).sort(dim=1)
-    assert torch.allclose(distance.cpu(), wanted[:, :4], atol=1e-12)
-    assert torch.equal(rows.cpu(), expected[:, :4])
+def test_what_is_no_place_is_not_found_and_finds_nothing(device: str) -> None:
+    points = torch.rand(20, 3, generator=draw(6), dtype=torch.float64, device="cpu")
+    points[3], points[7, 1], points[9, 2] = torch.nan, torch.inf, -torch.inf
+    queries = torch.tensor([[torch.nan, 0.0, 0.0], [0.0, torch.inf, 0.0], [0.5, 0.5, 0.5]])
+    given = [x.double().to(device) for x in (points, queries)]
+    away, rows = (x.cpu() for x in ops.nearest_points(*given, 20, 0.1))
+    assert bool(away[:2].isinf().all()) and bool((rows[:2] == -1).all())
+    assert sorted(rows[2, :17].tolist()) == [k for k in range(20) if k not in (3, 7, 9)]
+    assert rows[2, 17:].tolist() == [-1] * 3
+    none = ops.nearest_points(given[0][:0], given[1], 2, 0.1)
+    assert bool(none[0].isinf().all()) and bool((none[1] == -1).all())
+    assert ops.nearest_points(given[0], given[1][:0], 2, 0.1)[0].shape == (0, 2)
 
 
 def test_arguments_that_fit_nothing_are_refused() -> None:
@@ -147,11 +136,15 @@ def test_arguments_that_fit_nothing_are_refused() -> None:
     with pytest.raises(ValueError, match="at most 32767"):
         ops.largest_shares(None, (1, 1, 1), torch.zeros(1), torch.zeros(40000, 7).long())
     with pytest.raises(ValueError, match="cell"):
-        ops.nearest_in_cells(place, place, rank, rank[:1], rank[:0], [0.0] * 3, 0.0, 1)
+        ops.nearest_points(place, place, 1, 0.0)
     with pytest.raises(ValueError, match="count"):
-        ops.nearest_in_cells(place, place, rank, rank[:1], rank[:0], [0.0] * 3, 1.0, 0)
-    with pytest.raises(ValueError, match="start"):
-        ops.nearest_in_cells(place, place, rank, rank, rank[:0], [0.0] * 3, 1.0, 1)
+        ops.nearest_points(place, place, 0, 1.0)
+    with pytest.raises(ValueError, match="reach"):
+        ops.nearest_points(place, place, 1, 1.0, reach=float("nan"))
+    with pytest.raises(ValueError, match="go together"):
+        ops.nearest_points(place, place, 1, 1.0, group=rank)
+    with pytest.raises(ValueError, match="asked"):
+        ops.nearest_points(place, place, 1, 1.0, group=rank, asked=rank[:1])
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -1,12 +1,13 @@
-"""Nearest neighbours by cells are those of a tree."""
+"""Nearest neighbours are those of a tree."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
-from gsfluent.spatial.neighbours import grid_search, nearest, nearest_in_group, nearest_rows
+from gsfluent.spatial.neighbours import nearest, nearest_in_group, nearest_rows
 
 
 def _cloud(kind: str) -> tuple[torch.Tensor, np.ndarray]:
@@ -29,8 +30,8 @@ def _cloud(kind: str) -> tuple[torch.Tensor, np.ndarray]:
 @pytest.mark.parametrize("cell", [1e-3, 0.05, 10.0])
 def test_cells_find_what_a_tree_finds(kind: str, count: int, cell: float) -> None:
     points, queries = _cloud(kind)
-    expected, _ = nearest(points, queries, count, cell)
-    distance, index = grid_search(points, torch.from_numpy(queries), count, cell)
+    expected = cKDTree(points.numpy()).query(queries, k=[*range(1, count + 1)])[0]
+    distance, index = (torch.from_numpy(x) for x in nearest(points, queries, count, cell))
     np.testing.assert_allclose(distance.numpy(), expected, rtol=1e-9, atol=1e-12)
     reached = (points[index] - torch.from_numpy(queries)[:, None]).norm(dim=2)
     np.testing.assert_allclose(reached.numpy(), distance.numpy(), rtol=1e-9, atol=1e-12)
@@ -39,7 +40,7 @@ def test_cells_find_what_a_tree_finds(kind: str, count: int, cell: float) -> Non
 
 def test_nothing_asked_nothing_found() -> None:
     points, _ = _cloud("shell")
-    distance, index = grid_search(points, torch.zeros(0, 3, dtype=torch.float64), 3, 0.1)
+    distance, index = nearest_rows(points, torch.zeros(0, 3, dtype=torch.float64), 3, 0.1)
     assert distance.shape == (0, 3)
     assert index.shape == (0, 3)
 
@@ -81,13 +82,6 @@ def test_no_groups_nothing_found() -> None:
         none, nobody, torch.zeros(2, 3), torch.tensor([0, 1]), 3, 1.0
     )
     assert bool(distance.isinf().all()) and bool((index == -1).all())
-
-
-def test_beyond_the_reach_nothing_is_found() -> None:
-    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [9.0, 0, 0]], dtype=torch.float64)
-    distance, index = grid_search(points, points[:1], 3, 0.01, reach=0.5)
-    assert index[0, :2].tolist() == [0, 1]
-    assert bool(distance[0, 2].isinf())
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])

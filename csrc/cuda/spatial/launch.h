@@ -4,13 +4,14 @@
 #include <cuda_runtime_api.h>
 
 #include "core/distance.h"
+#include "core/nearest.h"
 #include "core/spatial.h"
 
 namespace gsf::cuda {
 
 cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream);
 cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream);
-cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream);
+cudaError_t nearest_points(const NearestArgs& a, cudaStream_t stream);
 cudaError_t box_sum(const BoxSumArgs& a, cudaStream_t stream);
 cudaError_t distance_pass(const DistanceArgs& a, cudaStream_t stream);
 template <typename T>

@@ -10,7 +10,7 @@ struct SpatialCuda {
   using Scope = CudaScope;
   GSF_LAUNCH(nearest_labels)
   GSF_LAUNCH(largest_shares)
-  GSF_LAUNCH(nearest_in_cells)
+  GSF_LAUNCH(nearest_points)
   GSF_LAUNCH(box_sum)
   GSF_LAUNCH(distance_pass)
   GSF_LAUNCH(trilinear)

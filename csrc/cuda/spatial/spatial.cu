@@ -1,4 +1,4 @@
-// CUDA kernels of the spatial ops: one thread for a point or a voxel, a warp for a query.
+// CUDA kernels of the spatial ops: one thread for a point or a voxel.
 #include "cuda/spatial/launch.h"
 
 namespace gsf::cuda {
@@ -83,42 +83,6 @@ __global__ void largest_shares_kernel(LargestSharesArgs a) {
   if (counts) settle(a, i, found);
 }
 
-// A warp for a query: its lanes ask 32 points at a time, and the first lane keeps the list.
-__global__ void nearest_in_cells_kernel(NearestInCellsArgs a) {
-  const int64_t i = thread_number() / 32;
-  const int lane = threadIdx.x % 32;
-  if (i >= a.count) return;  // whole warps
-  const NearestList list(a, i);
-  if (lane == 0) list.clear();
-  int64_t cell[3], begin, end;
-  if (!cell_of(a, i, cell)) return;
-  double worst = HUGE_VAL;
-  int64_t last = 0;
-  for (int line = 0; line < 9; ++line) {
-    line_of(a, cell, line, &begin, &end);
-    for (int64_t base = begin; base < end; base += 32) {
-      int64_t row = 0;
-      double away = HUGE_VAL;
-      const bool there = base + lane < end && candidate(a, i, base + lane, &row, &away);
-      unsigned left = __ballot_sync(~0u, there && nearer(away, row, worst, last));
-      while (left) {
-        const int source = __ffs(left) - 1;
-        const int64_t its = __shfl_sync(~0u, row, source);
-        const double far = __shfl_sync(~0u, away, source);
-        if (lane == 0) {
-          list.take(its, far);
-          worst = list.square[a.wanted - 1];
-          last = list.index[a.wanted - 1];
-        }
-        worst = __shfl_sync(~0u, worst, 0);
-        last = __shfl_sync(~0u, last, 0);
-        left &= left - 1;
-        left &= __ballot_sync(~0u, there && nearer(away, row, worst, last));
-      }
-    }
-  }
-}
-
 __global__ void box_sum_kernel(BoxSumArgs a) {
   const int64_t k = thread_number();
   if (k < a.voxels()) a.out[k] = a.sum(k);
@@ -159,11 +123,6 @@ cudaError_t nearest_labels(const NearestLabelsArgs& a, cudaStream_t stream) {
 
 cudaError_t largest_shares(const LargestSharesArgs& a, cudaStream_t stream) {
   if (a.count) largest_shares_kernel<<<blocks_for(a.count), kThreads, 0, stream>>>(a);
-  return cudaGetLastError();
-}
-
-cudaError_t nearest_in_cells(const NearestInCellsArgs& a, cudaStream_t stream) {
-  if (a.count) nearest_in_cells_kernel<<<blocks_for(32 * a.count), kThreads, 0, stream>>>(a);
   return cudaGetLastError();
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,22 +55,27 @@ def largest_shares(
     return first.view(out), second.view(out), (one - two).view(out)
 
 
-def nearest_in_cells(
-    points: Tensor, queries: Tensor, low: Sequence[float], cell: float, count: int
+def nearest_points(
+    points: Tensor,
+    queries: Tensor,
+    count: int,
+    *,
+    group: Tensor | None = None,
+    asked: Tensor | None = None,
+    reach: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`gsfluent.ops.nearest_in_cells`, from a table of all pairs."""
-    corner = torch.tensor(list(low), dtype=torch.float64)
-    of = ((points - corner) / cell).long()
-    mine = ((queries - corner) / cell).long()
-    near = ((of[None] - mine[:, None]).abs() <= 1).all(dim=2)
+    """As :func:`gsfluent.ops.nearest_points`, from a table of all pairs."""
     apart = points[None] - queries[:, None]
     x, y, z = (apart * apart).unbind(dim=2)
-    square = torch.where(near, (x + y) + z, math.inf)
-    short = max(count - len(points), 0)
-    square = torch.nn.functional.pad(square, (0, short), value=math.inf)
-    best, rows = square.sort(dim=1, stable=True)
+    away = torch.from_numpy(np.sqrt(((x + y) + z).numpy()))  # torch rounds the last bit elsewhere
+    may = away <= reach
+    if group is not None and asked is not None:
+        may &= group[None] == asked[:, None]
+    away = torch.where(may, away, math.inf)
+    away = torch.nn.functional.pad(away, (0, max(count - len(points), 0)), value=math.inf)
+    best, rows = away.sort(dim=1, stable=True)
     best, rows = best[:, :count], rows[:, :count]
-    return best, torch.where(best.isfinite(), rows, 0)
+    return best, torch.where(best.isfinite(), rows, -1)
 
 
 def box_blur(indicator: Tensor, width: int, times: int = 3) -> Tensor:

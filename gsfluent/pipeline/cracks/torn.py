@@ -16,6 +16,9 @@ from gsfluent.spatial.neighbours import nearest_in_group
 
 PART = 3
 """Points of a piece in a region for which that is divided; a chip may lie across two."""
+TRICKLE = 512
+"""Dust that is less than this part of its region stays in it until there is more: it costs as much
+to take out as a piece."""
 MOST = 32_000
 """Pieces that a region is split into at once, at most."""
 
@@ -75,13 +78,13 @@ class Shares(NamedTuple):
             bodies: The first so many are bodies that were whole; a small one is no chip.
         """
         chunk, many, dusty = self.chunk, self.many, self.piece == self.dust
-        times = torch.bincount(chunk[self._enough], minlength=regions)
-        size, lost = (torch.zeros_like(times) for _ in range(2))
+        pieces = torch.bincount(chunk[self._enough & ~dusty], minlength=regions)
+        size, lost = (torch.zeros_like(pieces) for _ in range(2))
         size.index_add_(0, chunk, many)
         lost.index_add_(0, chunk, torch.where(dusty, many, 0))
         chip = size < CHIP
         chip[:bodies] = False
-        torn = ((times > 1) | (lost > 0)) & ~chip
+        torn = ((pieces > 1) | ((lost > 0) & (TRICKLE * lost >= size))) & ~chip
         found = torch.stack([torn, chip & (2 * lost > size)]).cpu()
         return found[0].nonzero()[:, 0].tolist(), found[1].nonzero()[:, 0].tolist()
 
