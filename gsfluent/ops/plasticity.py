@@ -147,9 +147,8 @@ def _facts(law: Tensor, params: Tensor) -> tuple[bool, bool]:
             return known[1]
     flows = (law == LAWS["fluid"]) & (params[:, 2] > 0)
     thick = (law == LAWS["von_mises"]) & (params[:, 5] > 0) & (params[:, 7] == 0)
-    viscous, apart = torch.stack(
-        [(flows | thick).any(), compiled_apart(law, params).any()]
-    ).tolist()
+    rows = torch.stack([flows | thick, compiled_apart(law, params)])
+    viscous, apart = rows.any(dim=1).tolist()
     if versions is not None:
         _table_facts[params] = (versions, (viscous, apart))
     return viscous, apart

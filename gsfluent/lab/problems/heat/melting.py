@@ -1,4 +1,4 @@
-"""Conduction and melting of a bar of material points, against closed forms."""
+"""Conduction, melting and contact of bars of material points, against closed forms."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from gsfluent.lab.world.driver import place
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
 from gsfluent.materials.heat import thermal
+from gsfluent.pipeline.heat.touching import SHARE, touching
 
 LENGTH = 0.06  # of the bar [m]
 DENSITY = 1000.0
@@ -99,3 +100,68 @@ def melting_front() -> Iterator[Result]:
             f"front of melting ice / Neumann's, {cells} cells", stefan_front(cells), 1.0,
             tolerance=0.03, source="Neumann's solution (Carslaw and Jaeger 1959, 11.2)",
         )  # fmt: skip
+
+
+def half_bars(cells: int, shift: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float, float]:
+    """Cold ice and warm wax that touch: what is between them, before heat has reached their ends.
+
+    Args:
+        cells: Length of each bar in cells of two points.
+        shift: Of the points of the wax across the bars, in spacings.
+
+    Returns:
+        Temperature of the contact over the closed form's, both from the cold side; heat that passed
+        over the closed form's; and heat that was lost over what passed.
+    """
+    half, wide = 0.5 * LENGTH, 4
+    spacing = 0.5 * half / cells
+    edge = wide * spacing
+    parts, links = [], []
+    for number, offset in enumerate(((-half, 0.0, 0.0), (0.0, *(spacing * s for s in shift)))):
+        points = box(list(offset), [half, edge, edge], spacing)
+        links.append(ops.lattice_links(points, spacing)[0] + number * len(points))
+        parts.append(points.double())
+    pairs = touching(*parts, spacing)
+    links.append(pairs + pairs.new_tensor([0, len(parts[0])]))
+    part = torch.ones(sum(map(len, links)), dtype=torch.float64)
+    part[-len(pairs) :] = SHARE
+    rows = torch.stack([thermal("ice").row(), thermal("wax").row()]).double()
+    material = torch.arange(2, dtype=torch.int32).repeat_interleave(len(parts[0]))
+    cold, warm = -20.0, 20.0
+    start = torch.where(material == 0, cold, warm).double()
+    heat = ops.enthalpy(start, rows=rows, material=material)
+    mass = torch.full_like(heat, DENSITY * spacing**3)
+    k, c = rows[:, 0], rows[:, 2]
+    seconds = float((0.2 * half) ** 2 / (k / (DENSITY * c)).max())
+    to = {"device": place()}
+    after = ops.conduct(
+        heat.to(**to), mass=mass.to(**to), links=torch.cat(links).to(**to), spacing=spacing,
+        rows=rows.to(**to), material=material.to(**to), dt=seconds, share=part.to(**to),
+    ).cpu()  # fmt: skip
+    now = ops.temperature(after, rows=rows, material=material)[0]
+    x = torch.cat(parts)[:, 0]
+    beside = [now[(x.abs() < spacing) & (material == side)].mean() for side in (0, 1)]
+    between = float((k[0] * beside[0] + k[1] * beside[1]) / (k[0] + k[1]))
+    effusivity = (k * DENSITY * c).sqrt()
+    wanted = float((effusivity[0] * cold + effusivity[1] * warm) / effusivity.sum())
+    gained = (mass * (after - heat))[material == 0].sum()
+    series = effusivity[0] * effusivity[1] / effusivity.sum()
+    passed = float(series) * (warm - cold) * 2.0 * math.sqrt(seconds / math.pi) * edge**2
+    lost = float((mass * (after - heat)).sum())
+    return (between - cold) / (wanted - cold), float(gained) / passed, abs(lost) / passed
+
+
+@problem(tier="fast")
+def heat_contact() -> Iterator[Result]:
+    """Half a bar of ice and half a bar of wax touch, lattices in line and shifted."""
+    source = "two half-spaces: weighted by sqrt(k rho c) (Carslaw and Jaeger 1959, 2.15)"
+    for how, shift in (("in line", (0.0, 0.0)), ("shifted", (0.5, 0.3))):
+        between, passed, lost = half_bars(12, shift)
+        yield compare(
+            f"temperature of the contact / closed form, {how}", between, 1.0, tolerance=0.01,
+            source=source, note="from the cold side; 12 cells each",
+        )  # fmt: skip
+        yield compare(
+            f"heat that passed / closed form, {how}", passed, 1.0, tolerance=0.02, source=source
+        )
+        yield compare(f"heat lost / passed, {how}", lost, tolerance=1e-12, source="conservation")
