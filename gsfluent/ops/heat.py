@@ -100,12 +100,36 @@ def enthalpy(
     return over.clamp(max=0.0) * solid + inside * latent + (over - wide).clamp(min=0.0) * liquid
 
 
-def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
-    """Neighbours of points that lie one in each cell of a lattice along the axes.
+def lattice_cells(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Cells of points that lie one in each cell of a lattice along the axes.
 
     Args:
         points: Positions at rest in the axes of the lattice [m], [N, 3]; each may be off the middle
             of its cell by less than half of the spacing, a quarter by the sampling of solids.
+        spacing: Edge of a cell [m].
+
+    Returns:
+        Numbers of the cells, int64 [N, 3], and how far each point is off its middle [m], float64
+        [N, 3].
+
+    Raises:
+        ValueError: A wrong shape or spacing.
+    """
+    check_tensor("lattice_cells", "points", points, shape=("N", 3))
+    if not (math.isfinite(spacing) and spacing > 0.0):
+        raise ValueError(f"lattice_cells: spacing must be positive, got {spacing}")
+    turns = points.double() / spacing
+    angle = 2.0 * math.pi * turns
+    middle = torch.atan2(angle.sin().mean(dim=0), angle.cos().mean(dim=0)) / (2.0 * math.pi)
+    cell = torch.round(turns - middle)
+    return cell.long(), spacing * (turns - middle - cell)
+
+
+def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Neighbours of points that lie one in each cell of a lattice along the axes.
+
+    Args:
+        points: As for :func:`lattice_cells`.
         spacing: Edge of a cell [m].
 
     Returns:
@@ -115,13 +139,7 @@ def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: A wrong shape or spacing, or two points in one cell.
     """
-    check_tensor("lattice_links", "points", points, shape=("N", 3))
-    if not (math.isfinite(spacing) and spacing > 0.0):
-        raise ValueError(f"lattice_links: spacing must be positive, got {spacing}")
-    turns = points.double() / spacing
-    angle = 2.0 * math.pi * turns
-    middle = torch.atan2(angle.sin().mean(dim=0), angle.cos().mean(dim=0)) / (2.0 * math.pi)
-    cell = torch.round(turns - middle).long()
+    cell, _ = lattice_cells(points, spacing)
     cell = cell - cell.amin(dim=0) + 1
     size = cell.amax(dim=0) + 2
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]

@@ -227,7 +227,8 @@ def solver(row: Tensor, name: str, velocity: Tensor, dt: float, flip: float = 0.
     return ops.Solver(
         points.to(velocity), velocity, volume * float(row[6]), volume, dx=1.0,
         law=velocity.new_tensor([materials.LAWS[name]], dtype=torch.int32),
-        params=row[None].to(velocity), alpha=torch.zeros_like(volume), gravity=(0.0, 0.0, 0.0), dt=dt, flip=flip,
+        params=row[None].to(velocity), alpha=torch.zeros_like(volume), gravity=(0.0, 0.0, 0.0),
+        dt=dt, flip=flip,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.errors import InputError
 from gsfluent.pipeline.heat.ladder import LEVELS, at_level, thermal_of
-from gsfluent.pipeline.heat.touching import SHARE, groups, touching
+from gsfluent.pipeline.heat.touching import groups, touching, turned
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.scene.heat import Surroundings
@@ -33,6 +33,8 @@ class _Warm(NamedTuple):
     name: str
     rows: slice
     links: Tensor  # pairs of its points, from 0
+    rest: Tensor  # places at rest [m], and how far each is off the middle of its cell there
+    jitter: Tensor
     faces: Tensor  # open faces at rest
     table: Tensor  # thermal row, [1, 7]
     start: float  # degrees C
@@ -45,6 +47,13 @@ class _Part(NamedTuple):
     links: Tensor  # of those near enough, from 0
     faces: Tensor  # open ones
     stands: Tensor  # whether a point stands on the floor
+
+
+class _Met(NamedTuple):
+    """Where two bodies touch."""
+
+    pairs: Tensor  # points of both, from 0
+    share: Tensor  # of a face
 
 
 class Heat:
@@ -70,10 +79,11 @@ class Heat:
                 continue
             own = matter.rest[a:b].double().cpu() @ body.frame.rotation
             links, faces = ops.lattice_links(own, self.spacing)
+            jitter = ops.lattice_cells(own, self.spacing)[1] @ body.frame.rotation.T
             table = thermal_of(body.name, body.material).row()[None].to(device)
             self._warm.append(
-                _Warm(body.name, slice(a, b), links.to(device), faces.to(device), table,
-                      body.temperature)
+                _Warm(body.name, slice(a, b), links.to(device), matter.rest[a:b].double(),
+                      jitter.to(device), faces.to(device), table, body.temperature)
             )  # fmt: skip
         if self._warm and deterministic and device.type == "cuda":
             raise InputError(
@@ -140,24 +150,30 @@ class Heat:
             faces = (faces - stands.long()).clamp(min=0)
         return _Part(place, links, faces.to(place), stands)
 
-    def _met(self, parts: list[_Part]) -> dict[tuple[int, int], Tensor]:
-        """Pairs of points of the bodies that touch, by the numbers of these."""
-        met = {}
-        shown = [part.faces.nonzero()[:, 0] for part in parts] if len(parts) > 1 else []
-        for b in range(len(shown)):
+    def _met(self, parts: list[_Part]) -> dict[tuple[int, int], _Met]:
+        """Where bodies touch, by their numbers."""
+        met: dict[tuple[int, int], _Met] = {}
+        if len(parts) < 2:
+            return met
+        shown, places = [], []
+        for body, part in zip(self._warm, parts, strict=True):
+            place, rows = part.place.double(), part.faces.nonzero()[:, 0]
+            jitter = body.jitter[rows] @ turned(body.rest, place).T
+            shown.append(rows)
+            places.append(place[rows] - jitter)
+        for b in range(len(parts)):
             for a in range(b):
-                pairs = touching(
-                    parts[a].place[shown[a]], parts[b].place[shown[b]], self.spacing
-                )
+                pairs, share = touching(places[a], places[b], self.spacing)
                 if len(pairs):
-                    met[a, b] = torch.stack([shown[a][pairs[:, 0]], shown[b][pairs[:, 1]]], dim=1)
+                    ends = [shown[a][pairs[:, 0]], shown[b][pairs[:, 1]]]
+                    met[a, b] = _Met(torch.stack(ends, dim=1), share)
         return met
 
     def _flow(
         self,
         group: list[int],
         parts: list[_Part],
-        met: dict[tuple[int, int], Tensor],
+        met: dict[tuple[int, int], _Met],
         state: State,
         heat: Tensor,
     ) -> None:
@@ -167,17 +183,15 @@ class Heat:
         first = dict(zip(group, [sum(counts[:i]) for i in range(len(group))], strict=True))
         faces = torch.cat([parts[n].faces for n in group])
         links = torch.cat([parts[n].links + first[n] for n in group])
-        contact = [
-            pairs + pairs.new_tensor([first[a], first[b]])
-            for (a, b), pairs in met.items() if a in first
-        ]  # fmt: skip
-        share = None
-        if contact:
-            between = torch.cat(contact)
-            hidden = torch.bincount(between.reshape(-1), minlength=len(faces))
-            faces = (faces - SHARE * hidden).clamp(min=0.0)
-            share = torch.cat([heat.new_ones(len(links)), heat.new_full((len(between),), SHARE)])
-            links = torch.cat([links, between])
+        share = heat.new_ones(len(links)) if len(group) > 1 else None
+        for (a, b), contact in met.items():
+            if share is None or a not in first:
+                continue
+            pairs = contact.pairs + links.new_tensor([first[a], first[b]])
+            for end in pairs.unbind(dim=1):
+                faces = faces.index_add(0, end, -contact.share.to(faces))
+            links, share = torch.cat([links, pairs]), torch.cat([share, contact.share.to(share)])
+        faces = faces.clamp(min=0.0)
         wall = None
         at = torch.cat([parts[n].stands for n in group]).nonzero()[:, 0]
         if around.floor is not None and len(at):

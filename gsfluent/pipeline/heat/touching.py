@@ -13,37 +13,62 @@ REACH = 1.5
 Faces that lie on each other have their points one apart, and 1.22 where the lattices are off by
 half a spacing along both axes of the face.
 """
-SHARE = 0.5
-"""Share of a face that a pair of :func:`touching` stands for."""
+_NEIGHBOURS = 4  # of a point, on the face of another body
 
 
-def touching(first: Tensor, second: Tensor, spacing: float) -> Tensor:
-    """Pairs of points of two bodies that touch: every point with the nearest of the other body.
+def touching(first: Tensor, second: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Pairs of points of two bodies that touch, and the share of a face that each stands for.
 
-    A face of a point is met half by its own pair, and half by those that the points of the other
-    body make: the area of all pairs is the mean of what both bodies show each other.
+    Half of a point's face is spread over the nearest points of the other body, the nearer the more,
+    and half is what those spread over it. No point gets more than that half: what lies beside the
+    edge of a body that stands on it touches nothing.
 
     Args:
-        first, second: Points of two bodies that may have an open face [m], [N, 3] and [M, 3].
+        first: Points of a body that may have an open face, where they are without the jitter of
+            their sampling [m], [N, 3].
+        second: Those of another body, [M, 3].
         spacing: Edge of a point's cell [m].
 
     Returns:
-        Rows of ``first`` and ``second``, int64 [L, 2]; a pair that is nearest both ways is there
-        twice.
+        Rows of ``first`` and ``second``, int64 [L, 2], and the shares, [L]; a pair that was found
+        from both sides is there twice.
     """
-    reach = REACH * spacing
-    found = []
-    for own, other in ((first, second), (second, first)):
-        near = torch.zeros(0, 2, dtype=torch.int64, device=first.device)
-        if len(own) and len(other):
-            low, high = other.amin(dim=0) - reach, other.amax(dim=0) + reach
-            rows = ((own >= low) & (own <= high)).all(dim=1).nonzero()[:, 0]
-            if len(rows):
-                distance, index = nearest_rows(other, own[rows], 1, spacing)
-                met = distance[:, 0] <= reach
-                near = torch.stack([rows[met], index[met, 0]], dim=1)
-        found.append(near)
-    return torch.cat([found[0], found[1].flip(1)])
+    reach, pairs, shares = REACH * spacing, [], []
+    for own, other, flipped in ((first, second, False), (second, first, True)):
+        if not (len(own) and len(other)):
+            continue
+        low, high = other.amin(dim=0) - reach, other.amax(dim=0) + reach
+        rows = ((own >= low) & (own <= high)).all(dim=1).nonzero()[:, 0]
+        if not len(rows):
+            continue
+        distance, index = nearest_rows(other, own[rows], min(_NEIGHBOURS, len(other)), spacing)
+        beyond = (distance**2 - distance[:, :1] ** 2) / spacing**2
+        share = (1.0 - beyond).clamp(min=0.0) * (distance[:, :1] <= reach)
+        share = 0.5 * share / share.sum(dim=1, keepdim=True).clamp(min=1e-9)
+        got = share.new_zeros(len(other)).index_add(0, index.reshape(-1), share.reshape(-1))
+        share = share * (0.5 / got.clamp(min=0.5))[index]
+        at, column = share.nonzero().unbind(dim=1)
+        pair = torch.stack([rows[at], index[at, column]], dim=1)
+        pairs.append(pair.flip(1) if flipped else pair)
+        shares.append(share[at, column].to(first))
+    if not pairs:
+        return torch.zeros(0, 2, dtype=torch.int64, device=first.device), first.new_zeros(0)
+    return torch.cat(pairs), torch.cat(shares)
+
+
+def turned(rest: Tensor, now: Tensor) -> Tensor:
+    """Rotation that takes points at rest to where they are, best in the mean, [3, 3].
+
+    Args:
+        rest: [m], [N, 3].
+        now: The same points [m], [N, 3].
+
+    Source: Kabsch 1976.
+    """
+    left, _, right = torch.linalg.svd((now - now.mean(dim=0)).T @ (rest - rest.mean(dim=0)))
+    flip = torch.ones_like(left[0])
+    flip[2] = torch.linalg.det(left @ right)
+    return (left * flip) @ right
 
 
 def groups(count: int, pairs: list[tuple[int, int]]) -> list[list[int]]:
