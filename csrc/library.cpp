@@ -51,8 +51,8 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   // --- plasticity: constitutive update on strain e = b - I ---
   m.def(
       "return_mapping(Tensor strain, Tensor alpha, Tensor increment, Tensor law, Tensor params, "
-      "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0) -> "
-      "(Tensor, Tensor, Tensor, Tensor)");
+      "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0, "
+      "bool apart=True) -> (Tensor, Tensor, Tensor, Tensor)");
   m.def("neo_hookean_energy(Tensor strain, Tensor params, Tensor? material) -> Tensor");
   // Gradients of strain, alpha, increment, of six material columns per particle, and 1 where they
   // were computed (laws elastic and nacc, no guard).

@@ -22,7 +22,7 @@ struct PlasticityOps {
   static std::tuple<Tensor, Tensor, Tensor, Tensor> return_mapping(
       const Tensor& strain, const Tensor& alpha, const Tensor& increment, const Tensor& law,
       const Tensor& params, const OptTensor& material, double k, double epsilon, bool implicit,
-      double dt) {
+      double dt, bool apart) {
     const char* op = "return_mapping";
     check_shape(op, "strain", strain, {-1, 6});
     const int64_t n = strain.size(0);
@@ -63,6 +63,7 @@ struct PlasticityOps {
                                       .k = T(k),
                                       .epsilon = T(epsilon),
                                       .implicit_alpha = implicit,
+                                      .apart = apart,
                                       .dt = T(dt),
                                       .strain_out = mptr<T>(strain_out),
                                       .alpha_out = mptr<T>(alpha_out),

@@ -242,7 +242,7 @@ _return_mapping_backward.register_fake(
 
 
 def _setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-    strain, alpha, increment, law, params, material, *options = inputs
+    strain, alpha, increment, law, params, material, *options, _apart = inputs
     ctx.save_for_backward(output[1], strain, alpha, increment, law, params, material)
     ctx.options = options
 
@@ -253,7 +253,7 @@ def _backward(
     strain, alpha, increment, params = torch.ops.gsfluent.return_mapping_backward.default(
         grad_strain, grad_alpha, grad_stress, *ctx.saved_tensors, *ctx.options
     )
-    return strain, alpha, increment, None, params, *((None,) * (1 + len(ctx.options)))
+    return strain, alpha, increment, None, params, *((None,) * (2 + len(ctx.options)))
 
 
 torch.library.register_autograd("gsfluent::return_mapping", _backward, setup_context=_setup_context)

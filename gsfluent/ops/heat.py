@@ -100,12 +100,36 @@ def enthalpy(
     return over.clamp(max=0.0) * solid + inside * latent + (over - wide).clamp(min=0.0) * liquid
 
 
-def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
-    """Neighbours of points that lie one in each cell of a lattice along the axes.
+def lattice_cells(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Cells of points that lie one in each cell of a lattice along the axes.
 
     Args:
         points: Positions at rest in the axes of the lattice [m], [N, 3]; each may be off the middle
             of its cell by less than half of the spacing, a quarter by the sampling of solids.
+        spacing: Edge of a cell [m].
+
+    Returns:
+        Numbers of the cells, int64 [N, 3], and how far each point is off its middle [m], float64
+        [N, 3].
+
+    Raises:
+        ValueError: A wrong shape or spacing.
+    """
+    check_tensor("lattice_cells", "points", points, shape=("N", 3))
+    if not (math.isfinite(spacing) and spacing > 0.0):
+        raise ValueError(f"lattice_cells: spacing must be positive, got {spacing}")
+    turns = points.double() / spacing
+    angle = 2.0 * math.pi * turns
+    middle = torch.atan2(angle.sin().mean(dim=0), angle.cos().mean(dim=0)) / (2.0 * math.pi)
+    cell = torch.round(turns - middle)
+    return cell.long(), spacing * (turns - middle - cell)
+
+
+def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
+    """Neighbours of points that lie one in each cell of a lattice along the axes.
+
+    Args:
+        points: As for :func:`lattice_cells`.
         spacing: Edge of a cell [m].
 
     Returns:
@@ -115,13 +139,7 @@ def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     Raises:
         ValueError: A wrong shape or spacing, or two points in one cell.
     """
-    check_tensor("lattice_links", "points", points, shape=("N", 3))
-    if not (math.isfinite(spacing) and spacing > 0.0):
-        raise ValueError(f"lattice_links: spacing must be positive, got {spacing}")
-    turns = points.double() / spacing
-    angle = 2.0 * math.pi * turns
-    middle = torch.atan2(angle.sin().mean(dim=0), angle.cos().mean(dim=0)) / (2.0 * math.pi)
-    cell = torch.round(turns - middle).long()
+    cell, _ = lattice_cells(points, spacing)
     cell = cell - cell.amin(dim=0) + 1
     size = cell.amax(dim=0) + 2
     key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
@@ -160,6 +178,7 @@ def conduct(
     material: Tensor | None = None,
     wall: tuple[Tensor, Tensor] | None = None,
     air: tuple[Tensor, float, float] | None = None,
+    share: Tensor | None = None,
 ) -> Tensor:
     """Enthalpy of points after heat has flowed for a time.
 
@@ -180,6 +199,7 @@ def conduct(
             temperature [degrees C], [W].
         air: Open faces of each point, [N]; temperature of the air [degrees C]; and coefficient of
             heat transfer [W/(m^2 K)].
+        share: Share of a face that each link goes through, [L]; default: all of it.
 
     Returns:
         The enthalpy after ``dt``, [N].
@@ -199,10 +219,15 @@ def conduct(
         raise ValueError(f"{op}: dt must not be negative and spacing positive, got {dt}, {spacing}")
     solid_k, liquid_k, solid_c, liquid_c, _, span, _ = _rows(op, rows, material, count)
     a, b = links.unbind(dim=1)
+    if share is not None:
+        check_tensor(op, "share", share, shape=(len(links),), like=enthalpy)
     with torch.no_grad():
         most = torch.maximum(solid_k, liquid_k) * spacing
-        through = torch.zeros_like(mass).index_add(0, a, most[b]).index_add(0, b, most[a])
-        through = torch.maximum(through, torch.bincount(links.reshape(-1), minlength=count) * most)
+        part = torch.ones_like(most[a]) if share is None else share
+        through = torch.zeros_like(mass).index_add(0, a, part * most[b])
+        through = through.index_add(0, b, part * most[a])
+        faces = torch.zeros_like(mass).index_add(0, a, part).index_add(0, b, part)
+        through = torch.maximum(through, faces * most)
         if wall is not None:
             through = through.index_add(0, wall[0], 2.0 * most[wall[0]])
         if air is not None:
@@ -210,15 +235,17 @@ def conduct(
         rate = float((through / (mass * torch.minimum(solid_c, liquid_c))).max())
     steps = max(1, math.ceil(dt * rate / SAFE))
     for _ in range(steps):
-        warm, share = temperature(enthalpy, rows=rows, material=material)
-        mean = solid_k + share * (liquid_k - solid_k)
+        warm, liquid = temperature(enthalpy, rows=rows, material=material)
+        mean = solid_k + liquid * (liquid_k - solid_k)
         sides = _Sides(
-            torch.where((span == 0.0) & (share > 0.0) & (share < 1.0), liquid_k, mean),
-            torch.where((span == 0.0) & (share > 0.0) & (share < 1.0), solid_k, mean),
+            torch.where((span == 0.0) & (liquid > 0.0) & (liquid < 1.0), liquid_k, mean),
+            torch.where((span == 0.0) & (liquid > 0.0) & (liquid < 1.0), solid_k, mean),
         )
         drop = warm[b] - warm[a]
         k_a, k_b = sides.facing(a, drop > 0.0), sides.facing(b, drop < 0.0)
         flow = 2.0 * k_a * k_b / (k_a + k_b) * spacing * drop
+        if share is not None:
+            flow = share * flow
         power = torch.zeros_like(mass).index_add(0, a, flow).index_add(0, b, -flow)
         if wall is not None:
             at, held = wall

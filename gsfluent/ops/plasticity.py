@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsfluent._check import check_tensor
-from gsfluent.errors import InputError
 from gsfluent.materials.laws import LAWS, unstable
 from gsfluent.materials.phase_field import MODELS, SPLITS
 from gsfluent.ops import _plasticity_grad  # noqa: F401  (registers the gradient)
@@ -40,7 +39,7 @@ PARAM_COLUMNS = (
 # Tables already read and found right: tensor -> (version, rows it was checked against). Reading a
 # table on a GPU waits for the device, so it happens once per table and not once per step.
 _checked: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
-_viscous_tables: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+_table_facts: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
 def _is_new(tensor: Tensor, rows: int) -> bool:
@@ -114,7 +113,7 @@ def _check_values(op: str, law: Tensor, params: Tensor, material: Tensor | None)
 
 
 def compiled_apart(law: Tensor, params: Tensor) -> Tensor:
-    """Rows whose law is in csrc/core/material/more_laws.h, bool [M]: on the CPU only.
+    """Rows whose law is in csrc/core/material/more_laws.h, bool [M].
 
     Args:
         law: int32 [M].
@@ -130,32 +129,29 @@ def _check_apart(op: str, law: Tensor, params: Tensor) -> None:
         rows = law == LAWS[name]
         if not bool(rows.any()):
             continue
-        if law.is_cuda:
-            what = name
-            if name == "von_mises":
-                what = "von_mises with plastic_viscosity, softening or hardening by a power"
-            raise InputError(
-                f"{op}: law {what} has no CUDA kernel yet", hint="run on the CPU (device: cpu)"
-            )
         wrong = unstable(name, params[rows])
         if wrong:
             raise ValueError(f"{op}: {wrong}")
 
 
-def _viscous(law: Tensor, params: Tensor) -> bool:
-    """Tell whether a row has a viscosity; reads the tables when they are new."""
+def _facts(law: Tensor, params: Tensor) -> tuple[bool, bool]:
+    """Whether a row has a viscosity, and whether one's law is compiled apart.
+
+    Reads the tables when they are new.
+    """
     versions = None
     if not (law.is_inference() or params.is_inference()):
         versions = (params._version, law.data_ptr(), law._version)
-        known = _viscous_tables.get(params)
+        known = _table_facts.get(params)
         if known is not None and known[0] == versions:
-            return bool(known[1])
+            return known[1]
     flows = (law == LAWS["fluid"]) & (params[:, 2] > 0)
     thick = (law == LAWS["von_mises"]) & (params[:, 5] > 0) & (params[:, 7] == 0)
-    found = bool((flows | thick).any())
+    rows = torch.stack([flows | thick, compiled_apart(law, params)])
+    viscous, apart = rows.any(dim=1).tolist()
     if versions is not None:
-        _viscous_tables[params] = (versions, found)
-    return found
+        _table_facts[params] = (versions, (viscous, apart))
+    return viscous, apart
 
 
 def check_params(op: str, law: Tensor, params: Tensor) -> None:
@@ -273,7 +269,7 @@ def return_mapping(
       ``g = (1 - k)(1 - d)^2 + k``; alpha is the history, max psi+ / psi_t - 1
       (docs/theory/phase-field.md). The damage is a field: :func:`gsfluent.ops.damage_solve`.
     * 5 ``rigid``: no strain, no stress; how the body moves is the solver's matter.
-    * 7 ``yeoh``, 8 ``ogden``: rubber that stiffens. Never yield; on the CPU only.
+    * 7 ``yeoh``, 8 ``ogden``: rubber that stiffens. Never yield.
 
     The stored energy never increases. See docs/theory/return-mapping.md and docs/theory/laws.md.
 
@@ -337,7 +333,8 @@ def return_mapping(
         raise ValueError(f"{op}: epsilon must be in [0, 1), got {epsilon}")
     if not (0.0 <= dt < math.inf):
         raise ValueError(f"{op}: dt must be finite and not negative, got {dt}")
-    if dt == 0.0 and not torch.compiler.is_compiling() and _viscous(law, params):
+    viscous, apart = (False, True) if torch.compiler.is_compiling() else _facts(law, params)
+    if dt == 0.0 and viscous:
         raise ValueError(f"{op}: matter with viscosity needs dt, the time step in seconds")
     wants_gradient = any(t.requires_grad for t in (strain, alpha, increment, params))
     if math.isinf(k) and wants_gradient and torch.is_grad_enabled():
@@ -353,6 +350,7 @@ def return_mapping(
         float(epsilon),
         bool(implicit),
         float(dt),
+        apart,
     )
     return result[0], result[1], result[2], result[3]
 

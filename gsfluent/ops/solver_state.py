@@ -21,7 +21,7 @@ from gsfluent.ops.viscous import viscous_step
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
 MORE_LAWS, DAMAGE_FIELD, VISCOUS, VISCOUS_ANY = 3, 4, 5, 6
-"""Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``; the first two
+"""Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``; damage fields
 have kernels on the CPU only."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""

@@ -348,18 +348,18 @@ def _unbroken(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def insulated(shot: Shot) -> list[str]:
-    """Heat that somebody may wait for in vain: it passes neither between objects nor colliders."""
+    """Heat that somebody may wait for in vain: it passes between what has a temperature."""
     warm = {
         name: settings.temperature
         for name, settings in shot.objects.items()
         if settings.temperature is not None
     }
-    if not warm or (len(shot.objects) == 1 and not shot.colliders):
+    if not warm or (len(warm) == len(shot.objects) and not shot.colliders):
         return []
     said = ", ".join(f"{name} ({degrees:g} C)" for name, degrees in warm.items())
     return [
-        f"no heat passes between objects, or between them and colliders: {said}; hint: heat.air, "
-        "heat.transfer and heat.floor give and take it"
+        f"no heat passes to colliders, or to objects without a temperature: {said}; hint: give "
+        "objects one; heat.air, heat.transfer and heat.floor give and take it"
     ]
 
 

@@ -15,6 +15,7 @@ from gsfluent.ops import return_mapping
 from gsfluent.ops.reference import plasticity as reference
 
 F64 = torch.float64
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 TRELOAR = materials.natural_rubber
 BAND = materials.rubber_band
 STILL = torch.zeros(1, 3, 3, dtype=F64)
@@ -200,11 +201,19 @@ def test_refused_by_name() -> None:
 
 
 @pytest.mark.cuda
-def test_a_gpu_says_that_it_has_no_kernel() -> None:
-    for t in (table("yeoh"), table("ogden"), table("von_mises", c5=1.0)):
-        s = [a.cuda() for a in states("yeoh", 2)]
-        with pytest.raises(InputError, match="has no CUDA kernel yet"):
-            return_mapping(*s, **{k: v.cuda() for k, v in t.items()}, dt=DT)
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize("name", VISCOUS)
+def test_cuda_matches_cpu(name: str, dtype: torch.dtype) -> None:
+    """Rubber: test_laws.py."""
+    s, t = cast(dtype, *states("von_mises", 4000)), VISCOUS[name]
+    t = {"law": t["law"], "params": t["params"].to(dtype)}
+    want = return_mapping(*s, **t, dt=DT)
+    got = return_mapping(*(a.cuda() for a in s), **{k: v.cuda() for k, v in t.items()}, dt=DT)
+    bound = 2e-4 if dtype == torch.float32 else 1e-10
+    assert int(want[3][0]) > 100
+    for g, w in zip(got[:3], want[:3], strict=True):
+        assert (g.cpu() - w).abs().max() <= bound * float(w.abs().max())
+    assert (got[3].cpu() - want[3]).abs().max() <= (8 if dtype == torch.float32 else 0)
 
 
 def block(count: int = 4) -> Tensor:
@@ -212,19 +221,23 @@ def block(count: int = 4) -> Tensor:
     return torch.stack(torch.meshgrid(side, side, side, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
-def solver(row: Tensor, name: str, velocity: Tensor, dt: float) -> ops.Solver:
+def solver(row: Tensor, name: str, velocity: Tensor, dt: float, flip: float = 0.0) -> ops.Solver:
     points = block()
-    volume = torch.full((len(points),), 0.125, dtype=velocity.dtype)
+    volume = velocity.new_full((len(points),), 0.125)
     return ops.Solver(
         points.to(velocity), velocity, volume * float(row[6]), volume, dx=1.0,
-        law=torch.tensor([materials.LAWS[name]], dtype=torch.int32), params=row[None].to(velocity),
-        alpha=torch.zeros_like(volume), gravity=(0.0, 0.0, 0.0), dt=dt,
+        law=velocity.new_tensor([materials.LAWS[name]], dtype=torch.int32),
+        params=row[None].to(velocity), alpha=torch.zeros_like(volume), gravity=(0.0, 0.0, 0.0),
+        dt=dt, flip=flip,
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("name", ["yeoh", "ogden", "von_mises"])
-def test_resident_solver_follows_the_composed_operators(name: str, dtype: torch.dtype) -> None:
+def test_resident_solver_follows_the_composed_operators(
+    name: str, dtype: torch.dtype, device: str
+) -> None:
     """The same block, stretched and spun, by both engines; momentum is kept."""
     row = table(name, **({"c5": 30.0, "c2": 300.0} if name == "von_mises" else {}))["params"][0]
     points = block()
@@ -232,7 +245,7 @@ def test_resident_solver_follows_the_composed_operators(name: str, dtype: torch.
     velocity = centre @ torch.tensor([[1.5, 0.4, 0.0], [-0.8, -0.7, 0.0], [0.0, 0.3, -0.5]],
                                      dtype=F64)  # fmt: skip
     dt, steps = 0.02, 25
-    s = solver(row, name, velocity.to(dtype), dt)
+    s = solver(row, name, velocity.to(device, dtype), dt)
     s.advance(1e9, steps=steps)
     kw = {"law": torch.tensor([materials.LAWS[name]], dtype=torch.int32), "params": row[None]}
     volume = torch.full((len(points),), 0.125, dtype=F64)
@@ -242,10 +255,27 @@ def test_resident_solver_follows_the_composed_operators(name: str, dtype: torch.
         gravity=(0.0, 0.0, 0.0), **kw,
     )  # fmt: skip
     bound = 2e-4 if dtype == torch.float32 else 1e-9
-    assert (s.position.double() - state.position).abs().max() < bound
-    assert (s.velocity.double() - state.velocity).abs().max() < bound
-    assert (s.strain.double() - state.strain).abs().max() < bound
+    assert (s.position.double().cpu() - state.position).abs().max() < bound
+    assert (s.velocity.double().cpu() - state.velocity).abs().max() < bound
+    assert (s.strain.double().cpu() - state.strain).abs().max() < bound
     if name == "von_mises":
         assert float(state.alpha.max()) > 1e-2  # it flows
     total = s.velocity.double().mean(0)
     assert total.abs().max() < 1e-5
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("flip", [0.0, 0.5])
+@pytest.mark.parametrize("name", ["yeoh", "ogden", "von_mises"])
+def test_a_gpu_steps_as_the_cpu_does(name: str, flip: float) -> None:
+    """By steps of its own length, beside APIC and with a share of the points' own motion."""
+    row = table(name, **({"c5": 30.0, "c2": 300.0} if name == "von_mises" else {}))["params"][0]
+    points = block()
+    turn = torch.tensor([[1.5, 0.4, 0.0], [-0.8, -0.7, 0.0], [0.0, 0.3, -0.5]], dtype=F64)
+    velocity = (points - points.mean(0)) @ turn
+    both = [solver(row, name, velocity.to(device), 0.02, flip) for device in ("cpu", "cuda")]
+    for s in both:
+        s.advance(1e9, steps=25)
+    for what in ("position", "velocity", "strain", "alpha"):
+        want, got = (getattr(s, what).cpu() for s in both)
+        assert (got - want).abs().max() < 1e-9, what

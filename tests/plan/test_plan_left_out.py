@@ -136,7 +136,8 @@ PLATE = {"type": "plane", "at": [0, 0, -1], "normal": [0, 0, 1]}
 @pytest.mark.parametrize(("objects", "colliders", "said"), [
     ({"ice": WARM}, [], False),
     ({"ice": WARM, "pot": POT}, [], True),
-    ({"ice": WARM, "wax": WAX}, [], True),
+    ({"ice": WARM, "wax": WAX}, [], False),
+    ({"ice": WARM, "wax": WAX, "pot": POT}, [], True),
     ({"ice": WARM}, [PLATE], True),
     ({"pot": {"select": "all", "material": "wood"}}, [PLATE], False),
 ])  # fmt: skip

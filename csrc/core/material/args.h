@@ -18,6 +18,7 @@ struct ReturnMappingArgs {
   const int32_t* material;  // [count] row per particle, or null: row 0, or row i when rows == count
   T k, epsilon;
   bool implicit_alpha;
+  bool apart;     // whether a row may have a law of more_laws.h
   T dt;           // [s], for viscosity: grad v = increment / dt
   T* strain_out;  // [count, 6]
   T* alpha_out;   // [count]

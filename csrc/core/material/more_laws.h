@@ -178,6 +178,22 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping_more(const Sym3<T>& strain, T alp
   return {r.strain, r.stress, r.alpha, r.plastic, r.guarded, inverted, false};
 }
 
+// return_mapping_particle for every law there is.
+template <typename T>
+GSF_HOST_DEVICE ReturnFlags return_mapping_particle_more(const ReturnMappingArgs<T>& a, int64_t i) {
+  const int64_t row = a.material != nullptr ? a.material[i] : (a.rows == 1 ? 0 : i);
+  const bool known = row >= 0 && row < a.rows;
+  MaterialRow<T> material{};
+  if (known) material = load_material(a.params + kParamColumns * row);
+  const ReturnMapped<T> r = return_mapping_more(
+      load_sym3(a.strain + 6 * i), a.alpha[i], load_mat3(a.increment + 9 * i),
+      known ? a.law[row] : -1, material, NaccOptions<T>{a.k, a.epsilon, a.implicit_alpha}, a.dt);
+  store_sym3(a.strain_out + 6 * i, r.strain);
+  store_sym3(a.stress_out + 6 * i, r.stress);
+  a.alpha_out[i] = r.alpha;
+  return {r.plastic, r.guarded, r.inverted, r.invalid};
+}
+
 // --- wave speeds, as in wave_speed.h ---
 
 // With W' = dW/dx and d the isochoric deviator, d tau_i / d h_i - tau_i has 4 W'' d_i^2 beside the

@@ -15,7 +15,7 @@ namespace gsf {
 inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
-// kMoreLaws: those of more_laws.h too; on the CPU only (cpu/solver/solver_more.cpp).
+// kMoreLaws: those of more_laws.h too (on the CPU solver_more.cpp).
 // kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
 // kViscousBrittle, kViscousAny: as kBrittle, kAnyLaw, with springs beside elastic and NACC matter
 // (core/material/viscous.h; on the CPU solver_viscous.cpp).

@@ -1,17 +1,23 @@
 // CUDA kernels of return_mapping and neo_hookean_energy: one thread per particle; the counters of
 // return_mapping are reduced per block first.
-#include "core/material/return_mapping.h"
+#include "core/material/more_laws.h"
 #include "core/material/stored_energy.h"
 #include "cuda/material/launch.h"
 
 namespace gsf::cuda {
 namespace {
 
-template <typename T>
+// kMore: for laws of more_laws.h, too.
+template <typename T, bool kMore>
 __global__ void __launch_bounds__(128) return_mapping_kernel(const ReturnMappingArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   ReturnFlags f{false, false, false, false};
-  if (i < a.count) f = return_mapping_particle(a, i);
+  if (i < a.count) {
+    if constexpr (kMore)
+      f = return_mapping_particle_more(a, i);
+    else
+      f = return_mapping_particle(a, i);
+  }
   // Every thread of the block reaches the barriers below, also those past the end.
   const int plastic = __syncthreads_count(f.plastic);
   const int guarded = __syncthreads_count(f.guarded);
@@ -38,7 +44,10 @@ cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream
   if (args.count == 0) return cudaSuccess;
   constexpr int kThreads = 128;
   const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
-  return_mapping_kernel<T><<<blocks, kThreads, 0, stream>>>(args);
+  if (args.apart)
+    return_mapping_kernel<T, true><<<blocks, kThreads, 0, stream>>>(args);
+  else
+    return_mapping_kernel<T, false><<<blocks, kThreads, 0, stream>>>(args);
   return cudaGetLastError();
 }
 

@@ -51,6 +51,8 @@ void solver_keep(const SolverView<T>& s, int law_set, cudaStream_t stream) {
     launch_g2p<T, kBrittle, true>(s, stream);
   else if (with_springs(law_set))
     launch_g2p<T, kViscousAny, true>(s, stream);
+  else if (law_set == kMoreLaws)
+    launch_g2p<T, kMoreLaws, true>(s, stream);
   else
     launch_g2p<T, kAnyLaw, true>(s, stream);
 }

@@ -42,6 +42,8 @@ cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t strea
   for (const bool measure : {true, false})
     if (with_springs(law_set))
       prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
+    else if (law_set == kMoreLaws)
+      prime_kernel<T, kMoreLaws><<<homes, kThreads, 0, stream>>>(s, measure);
     else
       prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
   return cudaGetLastError();
@@ -71,6 +73,8 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     launch_g2p<T, kViscousBrittle, false>(s, stream);
   else if (law_set == kViscousAny)
     launch_g2p<T, kViscousAny, false>(s, stream);
+  else if (law_set == kMoreLaws)
+    launch_g2p<T, kMoreLaws, false>(s, stream);
   else
     launch_g2p<T, kAnyLaw, false>(s, stream);
   return cudaGetLastError();

@@ -6,4 +6,5 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     ladder="thawing",
     looks="Heat",
+    touching="touching",
 )

@@ -11,6 +11,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.errors import InputError
 from gsfluent.pipeline.heat.ladder import LEVELS, at_level, thermal_of
+from gsfluent.pipeline.heat.touching import groups, touching, turned
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.scene.heat import Surroundings
@@ -32,9 +33,27 @@ class _Warm(NamedTuple):
     name: str
     rows: slice
     links: Tensor  # pairs of its points, from 0
+    rest: Tensor  # places at rest [m], and how far each is off the middle of its cell there
+    jitter: Tensor
     faces: Tensor  # open faces at rest
     table: Tensor  # thermal row, [1, 7]
     start: float  # degrees C
+
+
+class _Part(NamedTuple):
+    """A body at a look."""
+
+    place: Tensor  # of its points [m]
+    links: Tensor  # of those near enough, from 0
+    faces: Tensor  # open ones
+    stands: Tensor  # whether a point stands on the floor
+
+
+class _Met(NamedTuple):
+    """Where two bodies touch."""
+
+    pairs: Tensor  # points of both, from 0
+    share: Tensor  # of a face
 
 
 class Heat:
@@ -60,10 +79,11 @@ class Heat:
                 continue
             own = matter.rest[a:b].double().cpu() @ body.frame.rotation
             links, faces = ops.lattice_links(own, self.spacing)
+            jitter = ops.lattice_cells(own, self.spacing)[1] @ body.frame.rotation.T
             table = thermal_of(body.name, body.material).row()[None].to(device)
             self._warm.append(
-                _Warm(body.name, slice(a, b), links.to(device), faces.to(device), table,
-                      body.temperature)
+                _Warm(body.name, slice(a, b), links.to(device), matter.rest[a:b].double(),
+                      jitter.to(device), faces.to(device), table, body.temperature)
             )  # fmt: skip
         if self._warm and deterministic and device.type == "cuda":
             raise InputError(
@@ -100,8 +120,10 @@ class Heat:
         heat = state.enthalpy
         assert heat is not None
         heat = heat.clone()
-        for body in self._warm:
-            heat[body.rows] = self._flowed(body, state, heat[body.rows])
+        parts = [self._part(body, state) for body in self._warm]
+        met = self._met(parts)
+        for group in groups(len(parts), list(met)):
+            self._flow(group, parts, met, state, heat)
         return self._softened(state._replace(enthalpy=heat), self._level(heat, state.level))
 
     def figures(self, state: State) -> dict[str, dict[str, float]]:
@@ -115,25 +137,76 @@ class Heat:
             found[body.name] = {"temperature": float(mean[0]), "liquid": float(mean[1])}
         return found
 
-    def _flowed(self, body: _Warm, state: State, heat: Tensor) -> Tensor:
-        """Enthalpy of a body's points after a look."""
-        around, place = self.around, state.position[body.rows]
+    def _part(self, body: _Warm, state: State) -> _Part:
+        """What a body has at a look."""
+        place = state.position[body.rows]
         a, b = body.links.unbind(dim=1)
         near = (place[a] - place[b]).norm(dim=1) <= APART * self.spacing
         links = body.links[near]
-        open_faces = 6 - torch.bincount(links.reshape(-1), minlength=len(heat))
-        wall = None
+        faces = 6 - torch.bincount(links.reshape(-1), minlength=len(place))
+        stands = torch.zeros_like(faces, dtype=torch.bool)
         if self.floor is not None:
             stands = place[:, 2] - self.floor < TOUCHES * self.spacing
-            open_faces = (open_faces - stands.long()).clamp(min=0)
-            if around.floor is not None and bool(stands.any()):
-                at = stands.nonzero()[:, 0]
-                wall = at, torch.full_like(heat[at], around.floor)
-        return ops.conduct(
-            heat, mass=state.particles.mass[body.rows].double(), links=links,
-            spacing=self.spacing, rows=body.table, dt=TICK * around.speed, wall=wall,
-            air=(open_faces.to(heat), around.air, around.transfer),
+            faces = (faces - stands.long()).clamp(min=0)
+        return _Part(place, links, faces.to(place), stands)
+
+    def _met(self, parts: list[_Part]) -> dict[tuple[int, int], _Met]:
+        """Where bodies touch, by their numbers."""
+        met: dict[tuple[int, int], _Met] = {}
+        if len(parts) < 2:
+            return met
+        shown, places = [], []
+        for body, part in zip(self._warm, parts, strict=True):
+            place, rows = part.place.double(), part.faces.nonzero()[:, 0]
+            jitter = body.jitter[rows] @ turned(body.rest, place).T
+            shown.append(rows)
+            places.append(place[rows] - jitter)
+        for b in range(len(parts)):
+            for a in range(b):
+                pairs, share = touching(places[a], places[b], self.spacing)
+                if len(pairs):
+                    ends = [shown[a][pairs[:, 0]], shown[b][pairs[:, 1]]]
+                    met[a, b] = _Met(torch.stack(ends, dim=1), share)
+        return met
+
+    def _flow(
+        self,
+        group: list[int],
+        parts: list[_Part],
+        met: dict[tuple[int, int], _Met],
+        state: State,
+        heat: Tensor,
+    ) -> None:
+        """Heat of bodies that touch after a look, into ``heat``."""
+        around, bodies = self.around, [self._warm[n] for n in group]
+        counts = [len(parts[n].place) for n in group]
+        first = dict(zip(group, [sum(counts[:i]) for i in range(len(group))], strict=True))
+        faces = torch.cat([parts[n].faces for n in group])
+        links = torch.cat([parts[n].links + first[n] for n in group])
+        share = heat.new_ones(len(links)) if len(group) > 1 else None
+        for (a, b), contact in met.items():
+            if share is None or a not in first:
+                continue
+            pairs = contact.pairs + links.new_tensor([first[a], first[b]])
+            for end in pairs.unbind(dim=1):
+                faces = faces.index_add(0, end, -contact.share.to(faces))
+            links, share = torch.cat([links, pairs]), torch.cat([share, contact.share.to(share)])
+        faces = faces.clamp(min=0.0)
+        wall = None
+        at = torch.cat([parts[n].stands for n in group]).nonzero()[:, 0]
+        if around.floor is not None and len(at):
+            wall = at, torch.full_like(heat[at], around.floor)
+        number = torch.arange(len(group), dtype=torch.int32, device=heat.device)
+        after = ops.conduct(
+            torch.cat([heat[body.rows] for body in bodies]),
+            mass=torch.cat([state.particles.mass[body.rows] for body in bodies]).double(),
+            links=links, spacing=self.spacing, rows=torch.cat([body.table for body in bodies]),
+            material=number.repeat_interleave(torch.tensor(counts, device=heat.device)),
+            dt=TICK * around.speed, wall=wall, share=share,
+            air=(faces.to(heat), around.air, around.transfer),
         )  # fmt: skip
+        for body, part in zip(bodies, after.split(counts), strict=True):
+            heat[body.rows] = part
 
     def _level(self, heat: Tensor, before: Tensor | None) -> Tensor:
         """Step of each point from solid to liquid, int8 [N]; what is near an edge stays."""

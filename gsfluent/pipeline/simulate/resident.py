@@ -10,9 +10,9 @@ solver goes on with the fields and the faces that follow.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -102,37 +102,53 @@ def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
 def apart(matter: Matter) -> Tensor:
     """Distance at which each point starts from the faces of other bodies [m], float64 [N].
 
-    As the solver finds faces (docs/theory/contact.md, "At a point"), up to a cell.
+    As the solver finds faces (docs/theory/contact.md, "At a point"), up to a cell. On the device of
+    the points; sums are in the order of the points.
     """
-    from scipy.spatial import cKDTree
+    place = matter.rest.double() / matter.dx
+    found = torch.zeros_like(place[:, 0])
+    near = torch.zeros_like(found, dtype=torch.bool)
+    body = torch.zeros_like(near, dtype=torch.int64)
+    boxes = [(place[a:b].amin(0) - 1.0, place[a:b].amax(0) + 1.0) for a, b in matter.ranges]
+    for one, (a, b) in enumerate(matter.ranges):
+        body[a:b] = one
+        for other, (low, high) in enumerate(boxes):
+            if other != one:
+                near[a:b] |= ((place[a:b] >= low) & (place[a:b] <= high)).all(dim=1)
+    rows = near.nonzero()[:, 0]
+    if len(rows):
+        volume = matter.particles.volume.double()[rows] / matter.dx**3
+        found[rows] = _of_others(place[rows], volume, body[rows])
+    distance = torch.linspace(0.9, -1.9, 28001, dtype=torch.float64, device=place.device)
+    share = touch.share(distance)  # grows along these
+    after = torch.searchsorted(share, found).clamp(1, len(share) - 1)
+    way = (found - share[after - 1]) / (share[after] - share[after - 1])
+    at = distance[after - 1] + way.clamp(0.0, 1.0) * (distance[after] - distance[after - 1])
+    return matter.dx * (at - 1e-5)  # a little less: rounding pushes nobody
 
-    place = matter.rest.double().cpu().numpy() / matter.dx
-    volume = matter.particles.volume.double().cpu().numpy() / matter.dx**3
-    found = np.zeros(len(place))
 
-    def near(own: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
-        there = place[slice(*other)]
-        low, high = there.min(0) - 1.0, there.max(0) + 1.0
-        here = place[slice(*own)]
-        return np.flatnonzero(((here >= low) & (here <= high)).all(1)) + own[0]
-
-    for a, second in enumerate(matter.ranges):
-        for first in matter.ranges[:a]:
-            one, two = near(first, second), near(second, first)
-            if not len(one) or not len(two):
-                continue
-            pairs = cKDTree(place[one]).sparse_distance_matrix(
-                cKDTree(place[two]), 1.0, output_type="ndarray"
-            )
-            weight = touch.kernel(torch.from_numpy(pairs["v"])).numpy()
-            one, two = one[pairs["i"]], two[pairs["j"]]
-            np.add.at(found, one, weight * volume[two])
-            np.add.at(found, two, weight * volume[one])
-    distance = np.linspace(0.9, -1.9, 28001)  # the share grows along these
-    share = touch.share(torch.from_numpy(distance)).numpy()
-    # a little less: rounding pushes nobody
-    apart = torch.from_numpy(matter.dx * (np.interp(found, share, distance) - 1e-5))
-    return apart.to(matter.particles.volume.device)
+def _of_others(place: Tensor, volume: Tensor, body: Tensor) -> Tensor:
+    """Share of space about each point that is other bodies' [N]; places and volumes in cells."""
+    cell = place.floor().long()
+    cell = cell - cell.amin(dim=0) + 1
+    size = cell.amax(dim=0) + 2
+    steps = [int(size[1] * size[2]), int(size[2]), 1]
+    key = (cell * cell.new_tensor(steps)).sum(dim=1)
+    ordered, order = torch.sort(key, stable=True)
+    found = torch.zeros_like(volume)
+    for i, j, k in itertools.product((-1, 0, 1), repeat=3):
+        there = key + i * steps[0] + j * steps[1] + k * steps[2]
+        first = torch.searchsorted(ordered, there)
+        count = torch.searchsorted(ordered, there, right=True) - first
+        rows = count.nonzero()[:, 0]  # of those with a next point in that cell
+        for n in range(int(count.max())):
+            rows = rows[count[rows] > n]
+            other = order[first[rows] + n]
+            own = (body[other] != body[rows]).nonzero()[:, 0]
+            at, other = rows[own], other[own]
+            distance = (place[at] - place[other]).norm(dim=1)
+            found[at] += volume[other] * touch.kernel(distance)
+    return found
 
 
 class Resident:

@@ -18,7 +18,9 @@ from gsfluent.lab.problems.heat.melting import stefan_number
 from gsfluent.materials.heat import thermal
 from gsfluent.pipeline.heat import Heat
 from gsfluent.pipeline.heat.ladder import LEVELS, at_level, thawing
+from gsfluent.pipeline.heat.touching import groups, touching, turned
 from gsfluent.pipeline.matter.points import build_matter
+from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene import Scene, Surroundings
 
@@ -69,6 +71,66 @@ def test_chocolate_on_a_stove_becomes_a_puddle_and_energy_does_not_rise() -> Non
     assert heights[-1] < 0.6 * heights[0]
     total = [sum(f.energy[k] for k in ("kinetic", "elastic", "gravity")) for f in frames]
     assert max(total) <= total[0] * 1.001
+
+
+def stacked(turn: torch.Tensor, device: str = "cpu") -> tuple[Heat, State]:
+    """Ice of -20 degrees C under wax of 20, both cubes of 2 cm, all turned; without air."""
+    scene = Scene(floor=None, heat=Surroundings(transfer=0.0, speed=600.0))
+    for name, degrees, up in (("ice", -20.0, 0.0), ("wax", 20.0, 0.02)):
+        frame = Frame(turn, turn @ torch.tensor([0.0, 0.0, up]).double(), 1.0)
+        scene.add(block((0.02,) * 3, 0.0025), name, frame=frame, temperature=degrees, name=name)
+    run = gf.pipeline.Simulate(dx=0.005, device=device).run_of(scene, 10.0)
+    return run.heat, run.state
+
+
+@pytest.mark.parametrize(
+    "turn", [torch.eye(3), torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])]
+)
+def test_heat_flows_between_bodies_that_touch(turn: torch.Tensor) -> None:
+    """As much as between two half-spaces, and none is lost; not once they have parted."""
+    heat, state = stacked(turn.double())
+    mass, begun = state.particles.mass.double(), state.enthalpy
+    ice, wax = (body.rows for body in heat._warm)
+    seconds = 6
+    for tick in range(1, seconds + 1):
+        state = heat.look(state._replace(time=tick / 60.0))
+    assert begun is not None and state.enthalpy is not None
+    gained = (mass * (state.enthalpy - begun))[ice].sum()
+    lost = (mass * (begun - state.enthalpy))[wax].sum()
+    assert float(gained) == pytest.approx(float(lost), rel=1e-12)
+    effusivity = []
+    for rows, name in ((ice, "ice"), (wax, "wax")):
+        k, c = (float(v) for v in thermal(name).row()[[0, 2]])
+        effusivity.append(math.sqrt(k * c * float(mass[rows].sum()) / 8e-6))
+    series = effusivity[0] * effusivity[1] / sum(effusivity)
+    passed = series * 40.0 * 2.0 * math.sqrt(600.0 * seconds / 60.0 / math.pi) * 4e-4
+    assert float(gained) == pytest.approx(passed, rel=0.05)
+    apart = state.position.clone()
+    apart[wax] += 0.003 * turn[:, 2]
+    later = heat.look(state._replace(position=apart, time=0.2))
+    assert later.enthalpy is not None
+    assert float((mass * (later.enthalpy - state.enthalpy))[ice].sum()) == pytest.approx(
+        0.0, abs=1e-9 * float(gained)
+    )
+
+
+def test_a_cube_on_a_table_touches_it_with_its_own_face() -> None:
+    """Lattices off by part of a cell: the pairs stand for 8 x 8 faces, one for each point there."""
+    side, wide = torch.arange(8).double() + 0.5, torch.arange(20).double() + 0.5
+    grid = [torch.cartesian_prod(s, s, torch.zeros(1).double()) for s in (side, wide)]
+    for off in ((6.0, 6.0), (6.5, 6.3), (5.8, 6.5)):
+        top = grid[0] + torch.tensor([*off, 1.0])
+        pairs, share = touching(top, grid[1], 1.0)
+        face = torch.zeros(64).double().index_add(0, pairs[:, 0], share)
+        assert torch.allclose(face, torch.ones_like(face))
+        assert len(touching(top + torch.tensor([0.0, 0.0, 0.6]), grid[1], 1.0)[0]) == 0
+
+
+def test_the_jitter_of_points_is_taken_back_as_their_body_has_turned() -> None:
+    places = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)).double()
+    turn = torch.tensor([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]]).double()
+    assert torch.allclose(turned(places, places @ turn.T + 3.0), turn)
+    assert groups(5, [(0, 3), (1, 4), (3, 4)]) == [[0, 1, 3, 4], [2]]
 
 
 def test_without_a_temperature_nothing_is_there() -> None:
@@ -217,3 +279,15 @@ def test_ice_melts_on_the_gpu_as_on_the_cpu() -> None:
         simulate = gf.pipeline.Simulate(dx=0.005, splats=False, device=device)
         shares.append([f.stats["heat"]["it"]["liquid"] for f in simulate(scene, 10, 0.2)][-1])
     assert shares[1] == pytest.approx(shares[0], rel=1e-3)
+
+
+@pytest.mark.cuda
+def test_bodies_that_touch_give_each_other_the_same_heat_on_a_gpu() -> None:
+    warm = []
+    for device in ("cpu", "cuda"):
+        heat, state = stacked(torch.eye(3).double(), device)
+        state = heat.look(state._replace(time=1.0 / 60.0))
+        assert state.enthalpy is not None
+        warm.append(state.enthalpy.cpu())
+    assert float((warm[0] - warm[0].mean()).abs().max()) > 1e4
+    assert torch.allclose(warm[1], warm[0], rtol=1e-5, atol=1e-2)

@@ -12,8 +12,10 @@ from simulation_shapes import ellipsoid
 from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.errors import InputError
+from gsfluent.ops.reference import touch
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.pipeline.simulate.engine import SolverOptions
+from gsfluent.pipeline.simulate.resident import apart
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.scene.scene import Scene
 
@@ -201,6 +203,23 @@ def _fallen(surface: bool) -> float:
 
 def test_bodies_lie_on_each_other_where_their_points_end() -> None:
     assert abs(_fallen(surface=True)) < 0.1
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("gap", [-0.3, 0.0, 0.4])
+def test_how_far_points_start_from_the_faces_of_others(gap: float, device: str) -> None:
+    """As defined, by every pair of points; what is out of reach counts as a cell away and more."""
+    scene = _stacked(gap * DX, True, gravity=0.0).scene
+    matter = build_matter(scene, DX, device=device)
+    got = apart(matter).cpu() / DX
+    place, volume = matter.rest.double().cpu() / DX, matter.particles.volume.double().cpu() / DX**3
+    first = torch.arange(len(place)) < matter.ranges[0][1]
+    weight = touch.kernel(torch.cdist(place, place)) * (first[:, None] != first[None, :])
+    found = (weight * volume).sum(dim=1)
+    met = found > 1e-4
+    assert int(met.sum()) > 100
+    assert torch.allclose(touch.share(got[met] + 1e-5), found[met], rtol=0.0, atol=1e-6)
+    assert bool((got[~met] > 0.7).all())
 
 
 def test_bodies_that_overlap_at_the_start_are_not_thrown_apart() -> None:

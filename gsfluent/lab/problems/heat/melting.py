@@ -1,4 +1,4 @@
-"""Conduction and melting of a bar of material points, against closed forms."""
+"""Conduction, melting and contact of bars of material points, against closed forms."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from gsfluent.lab.world.driver import place
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
 from gsfluent.materials.heat import thermal
+from gsfluent.pipeline.heat.touching import touching
 
 LENGTH = 0.06  # of the bar [m]
 DENSITY = 1000.0
@@ -99,3 +100,80 @@ def melting_front() -> Iterator[Result]:
             f"front of melting ice / Neumann's, {cells} cells", stefan_front(cells), 1.0,
             tolerance=0.03, source="Neumann's solution (Carslaw and Jaeger 1959, 11.2)",
         )  # fmt: skip
+
+
+def _around(points: Tensor, edge: float) -> Tensor:
+    """Points of a bar and of the eight beside it, its own first."""
+    steps = sorted(((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)), key=lambda s: s != (0, 0))
+    return torch.cat([points + points.new_tensor([0.0, edge * i, edge * j]) for i, j in steps])
+
+
+def half_bars(cells: int, shift: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float, float]:
+    """Cold ice and warm wax that touch: what is between them, before heat has reached their ends.
+
+    The bars go on periodically across.
+
+    Args:
+        cells: Length of each bar in cells of two points.
+        shift: Of the points of the wax across the bars, in spacings.
+
+    Returns:
+        Temperature of the contact over the closed form's, both from the cold side; heat that passed
+        over the closed form's; and heat that was lost over what passed.
+    """
+    half, wide = 0.5 * LENGTH, 4
+    spacing = 0.5 * half / cells
+    edge = wide * spacing
+    parts, links = [], []
+    for number, offset in enumerate(((-half, 0.0, 0.0), (0.0, *(spacing * s for s in shift)))):
+        points = box(list(offset), [half, edge, edge], spacing)
+        links.append(ops.lattice_links(points, spacing)[0] + number * len(points))
+        parts.append(points.double())
+    count = len(parts[0])
+    pairs, share = touching(_around(parts[0], edge), _around(parts[1], edge), spacing)
+    own = pairs[:, 0] < count
+    links.append(pairs[own] % count + pairs.new_tensor([0, count]))
+    part = torch.ones(sum(map(len, links)), dtype=torch.float64)
+    part[-len(links[-1]) :] = share[own]
+    rows = torch.stack([thermal("ice").row(), thermal("wax").row()]).double()
+    material = torch.arange(2, dtype=torch.int32).repeat_interleave(count)
+    cold, warm = -20.0, 20.0
+    start = torch.where(material == 0, cold, warm).double()
+    heat = ops.enthalpy(start, rows=rows, material=material)
+    mass = torch.full_like(heat, DENSITY * spacing**3)
+    k, c = rows[:, 0], rows[:, 2]
+    seconds = float((0.2 * half) ** 2 / (k / (DENSITY * c)).max())
+    after = ops.conduct(
+        heat.to(place()), mass=mass.to(place()), links=torch.cat(links).to(place()),
+        spacing=spacing, rows=rows.to(place()), material=material.to(place()), dt=seconds,
+        share=part.to(place()),
+    ).cpu()  # fmt: skip
+    now = ops.temperature(after, rows=rows, material=material)[0]
+    x = torch.cat(parts)[:, 0]
+    beside = [now[(x.abs() < spacing) & (material == side)].mean() for side in (0, 1)]
+    between = float((k[0] * beside[0] + k[1] * beside[1]) / (k[0] + k[1]))
+    effusivity = (k * DENSITY * c).sqrt()
+    wanted = float((effusivity[0] * cold + effusivity[1] * warm) / effusivity.sum())
+    gained = (mass * (after - heat))[material == 0].sum()
+    series = effusivity[0] * effusivity[1] / effusivity.sum()
+    passed = float(series) * (warm - cold) * 2.0 * math.sqrt(seconds / math.pi) * edge**2
+    lost = float((mass * (after - heat)).sum())
+    return (between - cold) / (wanted - cold), float(gained) / passed, abs(lost) / passed
+
+
+@problem(tier="fast")
+def heat_contact() -> Iterator[Result]:
+    """Half a bar of ice and half a bar of wax touch, lattices in line and shifted."""
+    source = "two half-spaces: weighted by sqrt(k rho c) (Carslaw and Jaeger 1959, 2.15)"
+    for how, shift in (("in line", (0.0, 0.0)), ("shifted", (0.5, 0.3))):
+        _, coarse, _ = half_bars(12, shift)
+        between, passed, lost = half_bars(24, shift)
+        yield compare(
+            f"temperature of the contact / closed form, {how}, 24 cells", between, 1.0,
+            tolerance=0.001, source=source, note="from the cold side",
+        )  # fmt: skip
+        yield compare(
+            f"heat that passed / closed form, {how}, 24 cells", passed, 1.0, tolerance=0.01,
+            source=source, note=f"{coarse:.4f} at 12 cells",
+        )  # fmt: skip
+        yield compare(f"heat lost / passed, {how}", lost, tolerance=1e-12, source="conservation")
