@@ -355,9 +355,7 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(
-        self, ranks: int, devices: Sequence[str | torch.device] | None, pushed: bool
-    ) -> int:
+    def _ranks(self, ranks: int, devices: Sequence[str | torch.device] | None, pushed: bool) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
         if devices is not None:
             self.devices = check_devices(devices, self.device)

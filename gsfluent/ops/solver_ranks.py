@@ -75,9 +75,7 @@ class Parts:
         fields: Velocity fields.
     """
 
-    def __init__(
-        self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int
-    ) -> None:
+    def __init__(self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int) -> None:
         self.whole, self.devices, self.fields = whole, tuple(devices), fields
         self._equip(whole)
         self.parts = [self._part(device) for device in devices]
@@ -134,13 +132,10 @@ class Parts:
         rows = []
         for rank, part in enumerate(self.parts):
             clock = part.clock.cpu()
-            holders = part.holders
-            held = (holders >> rank & 1) == 1
-            shared = held & ((holders & ~(1 << rank)) != 0)
-            rows.append({
-                "points": int(clock[layout.INDEX["cursor"]]),
-                "homes": int(clock[layout.INDEX["homes"]]),
-                "slots": int(clock[layout.INDEX["slots"]]),
-                "shared": int(shared.sum()),
-            })  # fmt: skip
+            points, homes, slots = (
+                int(clock[layout.INDEX[name]]) for name in ("cursor", "homes", "slots")
+            )
+            holders = part.holders[part.slot_next[:slots].long()]
+            shared = int((holders != torch.ones_like(holders) << rank).sum())
+            rows.append({"points": points, "homes": homes, "slots": slots, "shared": shared})
         return rows

@@ -58,10 +58,12 @@ __global__ void end_kernel(const __grid_constant__ SolverView<T> s) {
     clock.wave = static_cast<uint64_t>(all[kMailWave]);
     clock.gradient = static_cast<uint64_t>(all[kMailGradient]);
     clock.bound = static_cast<uint64_t>(all[kMailBound]);
-    clock.plastic += all[kMailPlastic];
-    clock.guarded += all[kMailGuarded];
-    clock.inverted += all[kMailInverted];
-    clock.invalid += all[kMailInvalid];
+    if (s.rank == s.ranks) {  // the clock of all counts; those of the ranks have told
+      clock.plastic += all[kMailPlastic];
+      clock.guarded += all[kMailGuarded];
+      clock.inverted += all[kMailInverted];
+      clock.invalid += all[kMailInvalid];
+    }
     clock.touched = all[kMailTouched];
     clock.lost = all[kMailLost];
     clock.leaving = all[kMailLeaving];
