@@ -1,4 +1,7 @@
-"""Several ranks of the resident solver on CUDA: what each holds, and where (docs/theory/ranks.md)."""
+"""Several ranks of the resident solver on CUDA: what each holds, and where.
+
+See docs/theory/ranks.md.
+"""
 
 from __future__ import annotations
 
