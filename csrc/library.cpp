@@ -45,6 +45,12 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def(
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
   m.def("solver_ranks(Tensor[] buffers, int[] ints, float[] floats) -> Tensor");
+  m.def(
+      "solver_move_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
+      "bool back) -> ()");
+  m.def(
+      "solver_run_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
+      "int rounds, int steps) -> ()");
 
   m.def("blade_sides(Tensor position, Tensor blades, Tensor cut, float reach) -> Tensor");
 

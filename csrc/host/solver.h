@@ -66,6 +66,12 @@ enum SolverBuffer : int {
   kPush,
   kPress,
   kSlotGiven,
+  kHomeRank,
+  kHomePlace,
+  kHolders,
+  kNeeders,
+  kMail,
+  kPeers,
   kSolverBuffers
 };
 
@@ -83,6 +89,8 @@ enum SolverFloat : int {
   kSolverFloats
 };
 constexpr int64_t kMostRanks = 64;
+constexpr int64_t kViewBytes = 1024;  // room for a view
+static_assert(sizeof(SolverView<double>) <= kViewBytes);
 enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kRanks, kSolverInts };
 
 template <class Backend>
@@ -174,6 +182,12 @@ struct SolverOps {
         {"push", c * kBlockNodes, 4, i64, true},
         {"press", c * kBlockNodes, 4, i64, true},
         {"slot_given", c, 1, i32, true},
+        {"home_rank", h, 1, i32, true},
+        {"home_place", h, 1, i32, true},
+        {"holders", c, 1, i64, true},
+        {"needers", c, 1, i64, true},
+        {"mail", kMailWords + s.collider_count * kImpulseSums, 1, i64, true},
+        {"peers", ints[kRanks] + 1, kViewBytes, ScalarType::Byte, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -190,8 +204,8 @@ struct SolverOps {
       return b[i].numel() ? b[i].mutable_data_ptr() : nullptr;
     };
     s.ranks = static_cast<int32_t>(ints[kRanks]);
-    STD_TORCH_CHECK(ints[kRanks] >= 1 && ints[kRanks] <= (device ? 1 : kMostRanks),
-                    "solver: ranks must be 1 to ", kMostRanks, ", and 1 on a GPU");
+    STD_TORCH_CHECK(ints[kRanks] >= 1 && ints[kRanks] <= kMostRanks, "solver: ranks must be 1 to ",
+                    kMostRanks);
     s.fields = static_cast<int32_t>(ints[kFields]);
     STD_TORCH_CHECK(s.fields >= 1 && s.fields < kMaxSolverFields, "solver: fields must be 1 to ",
                     kMaxSolverFields - 1);
@@ -274,6 +288,12 @@ struct SolverOps {
     s.push = static_cast<int64_t*>(any_at(kPush));
     s.press = static_cast<int64_t*>(any_at(kPress));
     s.slot_given = int_at(kSlotGiven);
+    s.home_rank = int_at(kHomeRank);
+    s.home_place = int_at(kHomePlace);
+    s.holders = static_cast<uint64_t*>(any_at(kHolders));
+    s.needers = static_cast<uint64_t*>(any_at(kNeeders));
+    s.mail = static_cast<int64_t*>(any_at(kMail));
+    s.peers = static_cast<const SolverView<T>*>(any_at(kPeers));
     return s;
   }
 
@@ -305,10 +325,32 @@ struct SolverOps {
     return out[0];
   }
 
+  // Several ranks on CUDA: `parts` holds the buffers of each, one after the other, and `buffers`
+  // those of all. Points go to the ranks, or back.
+  static void solver_move_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
+                                std::vector<double> floats, bool back) {
+    call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
+      Backend::move_ranks(std::move(views), like, back);
+    });
+  }
+  // As solver_run.
+  static void solver_run_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
+                               std::vector<double> floats, int64_t rounds, int64_t steps) {
+    STD_TORCH_CHECK(rounds >= 0 && steps > 0, "solver_run: rounds and steps must be positive");
+    call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
+      Backend::run_ranks(std::move(views), like, law_set(ints), rounds, steps);
+    });
+  }
+
   static void register_all(Library& m) {
     GSF_IMPL(SolverOps, solver_prime);
     GSF_IMPL(SolverOps, solver_run);
-    if constexpr (Backend::kHasRanks) GSF_IMPL(SolverOps, solver_ranks);
+    if constexpr (Backend::kHasRanks) {
+      GSF_IMPL(SolverOps, solver_ranks);
+    } else {
+      GSF_IMPL(SolverOps, solver_move_ranks);
+      GSF_IMPL(SolverOps, solver_run_ranks);
+    }
   }
 
  private:
@@ -325,6 +367,40 @@ struct SolverOps {
     const typename Backend::Scope scope(b[kOffset]);
     dispatch_floating("solver", b[kOffset],
                       [&]<typename T>() { f(view<T>(b, ints, floats), scope); });
+  }
+
+  // f(views, one tensor of each) of the parts, and of all at the end.
+  template <typename F>
+  static void call_ranks(const Buffers& b, const Buffers& parts, const std::vector<int64_t>& ints,
+                         const std::vector<double>& floats, F&& f) {
+    STD_TORCH_CHECK(
+        ints.size() == kSolverInts && int64_t(parts.size()) == ints[kRanks] * kSolverBuffers,
+        "solver: expected ", int(kSolverBuffers), " buffers of each rank, got ", parts.size());
+    call(b, ints, floats, [&]<typename T>(const SolverView<T>& all, const auto&) {
+      std::vector<SolverView<T>> views;
+      Buffers like;
+      for (auto first = parts.begin(); first != parts.end(); first += kSolverBuffers) {
+        const Buffers part(first, first + kSolverBuffers);
+        views.push_back(view<T>(part, ints, floats));
+        like.push_back(part[kOffset]);
+        const SolverView<T>& s = views.back();
+        STD_TORCH_CHECK(s.count == all.count && s.home_capacity == all.home_capacity &&
+                            s.slot_capacity == all.slot_capacity &&
+                            s.table_size == all.table_size && s.row_count == all.row_count &&
+                            s.collider_count == all.collider_count &&
+                            (s.moments == nullptr) == (all.moments == nullptr),
+                        "solver: a rank must have the room that all have");
+      }
+      views.push_back(all);
+      like.push_back(b[kOffset]);
+      for (const SolverView<T>& s : views)
+        STD_TORCH_CHECK(s.peers != nullptr && s.holders != nullptr && s.needers != nullptr &&
+                            s.mail != nullptr && s.home_rank != nullptr && s.home_place != nullptr,
+                        "solver: ranks need peers, holders, needers, mail, home_rank, home_place");
+      STD_TORCH_CHECK(all.radius == nullptr, "solver: ranks on CUDA do not know radius");
+      STD_TORCH_CHECK(all.count <= int64_t(1) << 26, "solver: at most 2^26 points");
+      f(std::move(views), like);
+    });
   }
 };
 

@@ -25,6 +25,7 @@ from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
 from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
+from gsfluent.ops.solver_ranks import MOST_RANKS, Parts, check_devices
 from gsfluent.ops.solver_state import (
     DAMAGE_FIELD,
     MORE_LAWS,
@@ -40,8 +41,6 @@ CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
 RADIUS_MOST = 0.5
 """Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
-MOST_RANKS = 64
-"""``kMostRanks`` of ``csrc/host/solver.h``."""
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -146,7 +145,9 @@ class Solver(SolverState):
             velocities are given and read as they are for the observer.
         ranks: Parts that the scene is cut into at every build and that step side by side, telling
             each other what they share (docs/theory/ranks.md): the same bits for any number. In
-            lockstep on one CPU, which is slower than 1; the rehearsal for several devices. 1 to 64.
+            lockstep on one device, which is slower than 1; the rehearsal for several. 1 to 64.
+        devices: CUDA devices of one host, as in ``["cuda:0", "cuda:1"]``: one rank on each. That of
+            ``position`` and the others is among them. Default: all ranks where the points lie.
 
     Raises:
         TypeError: Wrong type or dtype.
@@ -191,6 +192,7 @@ class Solver(SolverState):
         flip: float = 0.0,
         frame: Sequence[float] | None = None,
         ranks: int = 1,
+        devices: Sequence[str | torch.device] | None = None,
     ) -> None:
         op = "Solver"
         check_tensor(op, "position", position, shape=(None, 3))
@@ -248,7 +250,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
-        self.ranks = self._ranks(ranks)
+        self.ranks = self._ranks(ranks, devices, radius is not None)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -318,6 +320,8 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
+        several = self.ranks > 1 and self.device.type == "cuda"
+        self._parts = Parts(b, self.devices, self.fields) if several else None
 
     def _per_field(self, name: str, given: Tensor | None) -> Tensor:
         """A whole number of each field, checked, where the state is."""
@@ -351,22 +355,33 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(self, ranks: int) -> int:
+    def _ranks(self, ranks: int, devices: Sequence[str | torch.device] | None, pushed: bool) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
+        if devices is not None:
+            self.devices = check_devices(devices, self.device)
+            if ranks not in (1, len(self.devices)):
+                raise InputError(
+                    f"Solver: {ranks} ranks on {len(self.devices)} devices",
+                    hint="leave out ranks: there is one on each device",
+                )
+            ranks = len(self.devices)
         if type(ranks) is not int or not 1 <= ranks <= MOST_RANKS:
             raise InputError(
                 f"Solver: ranks must be a whole number of 1 to {MOST_RANKS}, got {ranks!r}",
                 hint="1 steps the whole scene at once",
             )
+        if devices is None:
+            self.devices = [self.device] * ranks
         unknown = {
-            f"device {self.device.type}": self.device.type != "cpu",
+            f"device {self.device.type}": self.device.type not in ("cpu", "cuda"),
             "law phase_field (9)": self._law_set == DAMAGE_FIELD,
+            "radius on CUDA": pushed and self.device.type == "cuda",
         }
         found = [name for name, used in unknown.items() if used]
         if ranks > 1 and found:
             raise InputError(
                 f"Solver: {ranks} ranks do not know {' and '.join(found)} yet",
-                hint="leave out ranks, or what they do not know",
+                hint="leave out ranks and devices, or what they do not know",
             )
         return ranks
 
@@ -456,19 +471,34 @@ class Solver(SolverState):
         ints, floats = self._settings()
         with torch.no_grad():
             torch.ops.gsfluent.solver_prime(self._buffers.listed(), ints, floats)
+            parts = self._parts
+            if parts is not None:
+                parts.begin()
+                self._move_ranks(parts, back=False)
             while True:
                 now = self.clock()
-                if now["reason"]:
+                if now["done"] or now["reason"]:
+                    if parts is not None:
+                        self._move_ranks(parts, back=True)
+                    if not now["reason"]:
+                        return
                     self._write(done=1, rebuild=1)
                     raise SolverError(int(now["reason"]), now["time"], int(now["step"]))
-                if now["done"]:
-                    return
                 if now["grow"]:
                     self._grow(now)
-                rounds = self._rounds(now)
-                torch.ops.gsfluent.solver_run(
-                    self._buffers.listed(), ints, floats, rounds, self.steps_per_round
-                )
+                rounds, steps = self._rounds(now), self.steps_per_round
+                listed = self._buffers.listed()
+                if parts is None:
+                    torch.ops.gsfluent.solver_run(listed, ints, floats, rounds, steps)
+                else:
+                    torch.ops.gsfluent.solver_run_ranks(
+                        listed, parts.listed(), ints, floats, rounds, steps
+                    )
+
+    def _move_ranks(self, parts: Parts, *, back: bool) -> None:
+        """The points of all to the ranks, or back."""
+        listed, of_ranks = self._buffers.listed(), parts.listed()
+        torch.ops.gsfluent.solver_move_ranks(listed, of_ranks, *self._settings(), back)
 
     steps_per_round = 8
     """Steps between two chances to build blocks on a GPU."""
@@ -488,6 +518,8 @@ class Solver(SolverState):
         homes = max(int(1.5 * now["wanted_homes"]) + 64, b.home_start0.shape[0])
         slots = max(int(1.5 * now["wanted_slots"]) + 64, b.slot_next.shape[0])
         b.reserve_blocks(homes, slots, self.fields)
+        if self._parts is not None:
+            self._parts.grow(homes, slots)
         self._write(grow=0, rebuild=1)
 
     def rank_counts(self) -> list[dict[str, int]]:
@@ -498,12 +530,14 @@ class Solver(SolverState):
             that other ranks hold too and hear of in every step.
 
         Raises:
-            InputError: On a GPU, or before the first step.
+            InputError: Before the first step; of one rank on a GPU.
         """
+        if self._parts is not None and self.clock()["slots"] > 0:
+            return self._parts.counts()
         if self.device.type != "cpu" or self.clock()["slots"] == 0:
             raise InputError(
-                "Solver.rank_counts: there are no ranks on a GPU, and nothing is cut before a step",
-                hint="advance a solver on the CPU first",
+                "Solver.rank_counts: nothing is cut before a step, nor for one rank on a GPU",
+                hint="advance the solver first",
             )
         rows = torch.ops.gsfluent.solver_ranks(self._buffers.listed(), *self._settings())
         names = ("points", "homes", "slots", "shared")

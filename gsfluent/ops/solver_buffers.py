@@ -96,6 +96,12 @@ class Buffers:
     push: Tensor
     press: Tensor
     slot_given: Tensor
+    home_rank: Tensor
+    home_place: Tensor
+    holders: Tensor
+    needers: Tensor
+    mail: Tensor
+    peers: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -142,9 +148,22 @@ class Buffers:
                 self.press = torch.zeros_like(self.sums)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
+        if self.peers.numel():
+            self.reserve_ranks()
         self.key = torch.zeros(entries, dtype=torch.int64, device=device)
         self.table_count, self.table_mask = whole(entries), whole(entries)
         self.table_home, self.table_slot = whole(entries), whole(entries)
+
+    def reserve_ranks(self) -> None:
+        """Make room for what several ranks on CUDA need of blocks; who owns homes is kept."""
+        homes, slots = self.home_start0.shape[0], self.slot_next.shape[0]
+        device = self.offset.device
+        for name in ("home_rank", "home_place"):
+            old, new = getattr(self, name), torch.zeros(homes, dtype=torch.int32, device=device)
+            new[: old.shape[0]] = old
+            setattr(self, name, new)
+        self.holders = torch.zeros(slots, dtype=torch.int64, device=device)
+        self.needers = torch.zeros_like(self.holders)
 
 
 def planes(values: Tensor) -> Tensor:
@@ -193,13 +212,14 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(count, dtype=torch.int32)
     values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
     whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut",
-             "object", "slot_given")  # fmt: skip
+             "object", "slot_given", "home_rank", "home_place")  # fmt: skip
     for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):
         values[name] = zeros(0, 4, dtype=torch.int32)
-    for name in ("push", "press"):
+    for name in ("push", "press", "holders", "needers", "mail"):
         values[name] = zeros(0, dtype=torch.int64)
+    values["peers"] = zeros(0, dtype=torch.uint8)
     values["spring_rows"] = zeros(0, dtype=torch.float64)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
     values["impulse_units"] = zeros(0, IMPULSE_SUMS, dtype=torch.int64)

@@ -16,6 +16,7 @@ from gsfluent._check import check_tensor
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.plasticity import SLOW_UNLOADING, return_mapping, weakened
 from gsfluent.ops.solver_buffers import INDEX
+from gsfluent.ops.solver_ranks import Parts
 from gsfluent.ops.viscous import viscous_step
 
 UNBROKEN = -1.0
@@ -57,6 +58,7 @@ class SolverState:
     _unused: dict[str, Tensor]
     """alpha and peak where no law uses them, as given."""
     _law_set: int
+    _parts: Parts | None
 
     # --- loading ---
 
@@ -238,7 +240,7 @@ class SolverState:
 
     def memory(self) -> int:
         """Return the bytes of every tensor of the solver."""
-        return self._buffers.memory()
+        return self._buffers.memory() + (self._parts.memory() if self._parts else 0)
 
     # --- reading ---
 

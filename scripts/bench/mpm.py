@@ -4,6 +4,10 @@ python scripts/bench/mpm.py                                    # this machine's 
 python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md  # one core
 python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
+python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136 --markdown docs/measured/benchmarks.md
+
+With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the bits
+of one. Each call's way of the points to the devices and back is in the time of its 100 steps.
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
 eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
@@ -74,7 +78,9 @@ def points(n: int, cells: int, order: str, device: torch.device) -> tuple[Tensor
     return x.to(device), dx
 
 
-def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> ops.Solver:
+def build(
+    n: int, cells: int, order: str, kind: str, device: torch.device, **options: Any
+) -> ops.Solver:
     x, dx = points(n, cells, order, device)
     count = x.shape[0]
     young, nu = 1e5, 0.3
@@ -98,6 +104,7 @@ def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> op
         law=torch.tensor([law], dtype=torch.int32, device=device), body=body,
         params=torch.tensor([row], device=device), colliders=walls(n, dx, device),
         alpha=torch.full((count,), -0.4, device=device) if law else None, viscous=branch,
+        **options,
     )  # fmt: skip
 
 
@@ -135,6 +142,51 @@ def measure(n: int, cells: int, order: str, kind: str, device: torch.device) -> 
         "builds_per_step": counters["builds"] / counters["step"], "mean_height": height,
         "slots": counters["slots"], "homes": counters["homes"],
     }  # fmt: skip
+
+
+STATE = ("position", "velocity", "affine", "strain")
+
+
+def scaling(n: int, cells: int, counts: list[int]) -> list[dict[str, Any]]:
+    """One scene on several numbers of devices; the bits of the first are those to have."""
+    rows: list[dict[str, Any]] = []
+    want: list[Tensor] = []
+    for count in counts:
+        devices = [f"cuda:{i}" for i in range(count)]
+        several = {"devices": devices} if count > 1 else {}
+        solver = build(n, cells, "lattice", "elastic", torch.device("cuda:0"), **several)
+        solver.advance(steps=50)
+        times = seconds_per_step(solver, 100, 5)
+        have = [getattr(solver, name).cpu() for name in STATE]
+        want = want or have
+        parts = solver.rank_counts() if count > 1 else []
+        rows.append({
+            "grid": n, "cells": cells, "particles": solver.count, "devices": count,
+            "ms": 1e3 * times[len(times) // 2], "ms_best": 1e3 * times[0],
+            "same_bits": all(torch.equal(a, b) for a, b in zip(have, want, strict=True)),
+            "shared": max((part["shared"] for part in parts), default=0),
+            "memory_mib": solver.memory() / 2**20,
+        })  # fmt: skip
+        rows[-1]["times"] = rows[0]["ms"] / rows[-1]["ms"]
+        sys.stderr.write(f"{json.dumps(rows[-1])}\n")
+        del solver
+        torch.cuda.empty_cache()
+    return rows
+
+
+def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
+    lines = [
+        f"Device: {name}; torch {torch.__version__}. Elastic, lattice; whole steps, builds included.",
+        "",
+        "| points | devices | ms | times the first | bits of the first | shared blocks |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {r['particles']:,} | {r['devices']} | {r['ms']:.4f} | {r['times']:.2f} | "
+        f"{'yes' if r['same_bits'] else 'no'} | {r['shared']} |"
+        for r in rows
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def bar_and_peer(row: dict[str, Any], gpu: bool) -> tuple[float | None, float | None]:
@@ -176,6 +228,7 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="*", default=["elastic", "nacc", "two", "apart"])
     parser.add_argument("--orders", nargs="*", default=["lattice", "random"])
     parser.add_argument("--peer", type=Path, help="what physgaussian.py wrote")
+    parser.add_argument("--devices", nargs="*", type=int, help="numbers of GPUs: 1 2 4")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
@@ -188,6 +241,16 @@ def main() -> int:
     device = torch.device("cuda" if gpu else "cpu")
     if not gpu:
         torch.set_num_threads(options.threads)
+    if options.devices:
+        there = torch.cuda.device_count() if gpu else 0
+        if not 1 <= min(options.devices) <= max(options.devices) <= there:
+            parser.error(f"--devices: this machine has {there}, got {options.devices}")
+        rows = []
+        for text in options.rows or ["200:100", "300:136"]:
+            n, cells = (int(part) for part in text.split(":"))
+            rows += scaling(n, cells, options.devices)
+        name = torch.cuda.get_device_name()
+        return leave(options, "bench_mpm devices", scaling_table(name, rows), name, rows)
     default = ["100:24", "200:50", "200:80", "300:100"] if gpu else ["100:24"]
     rows = []
     for text in options.rows or default:
@@ -205,14 +268,20 @@ def main() -> int:
     if not gpu:
         kind = "process" if options.threads == 1 else "wall"
         name += f", {options.threads} thread(s), {kind} time, load {os.getloadavg()[0]:.1f}"
-    text = markdown(name, rows, gpu)
+    part = "bench_mpm" if gpu else f"bench_mpm {'cpu' if options.threads == 1 else 'threads'}"
+    return leave(options, part, markdown(name, rows, gpu), name, rows)
+
+
+def leave(
+    options: argparse.Namespace, part: str, text: str, name: str, rows: list[dict[str, Any]]
+) -> int:
+    """Print the table; write it and the rows to where they were asked for."""
     sys.stdout.write(text)
     if options.json:
         options.json.write_text(json.dumps({"device": name, "rows": rows}, indent=1) + "\n")
     if options.markdown:
         page = options.markdown
         old = page.read_text() if page.exists() else ""
-        part = "bench_mpm" if gpu else f"bench_mpm {'cpu' if options.threads == 1 else 'threads'}"
         page.write_text(enter(old, part, text.rstrip()))
     return 0
 

@@ -105,6 +105,23 @@ enum SolverReason : int64_t {
   kStepTooSmall = 5,  // the step fell below what time can resolve
 };
 
+// What one of several ranks on CUDA tells the others at the end of a step, from its clock; then
+// what its colliders got (kImpulseSums each).
+enum Mail : int {
+  kMailSpeed,
+  kMailWave,
+  kMailGradient,
+  kMailBound,
+  kMailPlastic,
+  kMailGuarded,
+  kMailInverted,
+  kMailInvalid,
+  kMailTouched,
+  kMailLost,
+  kMailLeaving,
+  kMailWords
+};
+
 // Everything about time and health that kernels read and write; every member is eight bytes, so
 // that Python reads it as one int64 or float64 tensor.
 struct SolverClock {
@@ -141,7 +158,8 @@ template <typename T>
 struct SolverView {
   int64_t count, home_capacity, slot_capacity, table_size, row_count, collider_count;
   int32_t fields;
-  int32_t ranks;  // CPU only: in lockstep (cpu/ranks)
+  int32_t ranks;  // parts of the scene: on a CPU in cpu/ranks, on devices in cuda/ranks
+  int32_t rank;   // CUDA, several ranks: which of them this is; `ranks` is the view of all
   T dx, inv_dx;
   T gravity[3];
   ContactLaw contact;
@@ -217,7 +235,22 @@ struct SolverView {
   int64_t* push;        // [S, 64, 4]
   int64_t* press;       // [S, 64, 4]
   int32_t* slot_given;  // [S] whether any of that is not 0: bit 0 of push, bit 1 of press
+  // of several ranks, on CUDA (cuda/ranks/ranks.h)
+  const SolverView<T>* peers;  // [ranks + 1] views of the ranks and of all; null: one rank
+  int32_t* home_rank;          // [H] of all: the rank that owns each home,
+  int32_t* home_place;         // [H] and the first of its points there
+  uint64_t* holders;           // [S] ranks that hold the sums of each slot, as bits
+  uint64_t* needers;           // [S] those of them that need its velocities
+  int64_t* mail;               // [kMailWords + K * kImpulseSums] what a rank tells the others
 
+  // Whether this rank answers for a slot: counts its contacts, books its impulses. The first does
+  // that needs its velocities.
+  GSF_HOST_DEVICE bool needs(int64_t slot) const {
+    return peers == nullptr || (needers[slot] >> rank & 1u) != 0;
+  }
+  GSF_HOST_DEVICE bool answers(int64_t slot) const {
+    return peers == nullptr || (needers[slot] & ((uint64_t(2) << rank) - 1)) == uint64_t(1) << rank;
+  }
   // Row of the particle with this meta word; garbage rows count as the first.
   GSF_HOST_DEVICE uint32_t row_of(uint32_t meta) const {
     return meta_row(meta) < uint64_t(row_count) ? meta_row(meta) : 0;

@@ -22,8 +22,9 @@ template <typename T>
 __global__ void __launch_bounds__(kSolverThreads)
     free_grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
-  const int64_t node = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
-  if (!may_step(clock) || node >= clock.slots * kBlockNodes) return;
+  const int64_t i = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
+  if (!may_step(clock) || i >= clock.slots * kBlockNodes) return;
+  const int64_t node = held_slot(s, i / kBlockNodes) * kBlockNodes + i % kBlockNodes;
   const NodeSums<T> sums = read_sums(s, node);
   clear_sums(s, node, 0);
   Vec3<T> v;
@@ -34,12 +35,15 @@ __global__ void __launch_bounds__(kSolverThreads)
 }  // namespace
 
 template <typename T>
-void solver_free(const SolverView<T>& s, cudaStream_t stream) {
+void solver_free_to_nodes(const SolverView<T>& s, cudaStream_t stream) {
   const int shift = split_shift(s);
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  free_p2g_kernel<T><<<homes << shift, kP2GThreads, 0, stream>>>(s, shift);
+}
+template <typename T>
+void solver_free_nodes(const SolverView<T>& s, cudaStream_t stream) {
   const unsigned nodes =
       static_cast<unsigned>((s.slot_capacity * kBlockNodes + kSolverThreads - 1) / kSolverThreads);
-  free_p2g_kernel<T><<<homes << shift, kP2GThreads, 0, stream>>>(s, shift);
   free_grid_kernel<T><<<nodes, kSolverThreads, 0, stream>>>(s);
 }
 
@@ -57,8 +61,9 @@ void solver_keep(const SolverView<T>& s, int law_set, cudaStream_t stream) {
     launch_g2p<T, kAnyLaw, true>(s, stream);
 }
 
-#define GSF_INSTANTIATE(T)                                          \
-  template void solver_free<T>(const SolverView<T>&, cudaStream_t); \
+#define GSF_INSTANTIATE(T)                                                   \
+  template void solver_free_to_nodes<T>(const SolverView<T>&, cudaStream_t); \
+  template void solver_free_nodes<T>(const SolverView<T>&, cudaStream_t);    \
   template void solver_keep<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

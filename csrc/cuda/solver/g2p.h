@@ -34,8 +34,8 @@ __device__ void hand_over(const SolverView<T>& s, const unsigned (&bits)[4], int
   __syncwarp();
 }
 
-// What the last warp of a step does: colliders move on, then time. Out of line, so that g2p does
-// not hold its registers.
+// What the last warp of a step does, once it knows of all ranks: colliders move on, then time. Out
+// of line, so that g2p does not hold its registers.
 template <typename T>
 __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   const int lane = threadIdx.x & 31;
@@ -151,7 +151,7 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws, kKeeps))
   unsigned bits[4];
   if (!end.leave(values, bits)) return;
   hand_over(s, bits, home, true);
-  if (last_to_arrive(&s.clock->arrived, arrivals)) end_of_step(s);
+  if (last_to_arrive(&s.clock->arrived, arrivals) && s.peers == nullptr) end_of_step(s);
 }
 
 template <typename T, int kLaws, bool kKeeps>

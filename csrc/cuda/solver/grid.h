@@ -11,6 +11,12 @@ namespace {
 constexpr int kGridCtas = 5;            // of a multiprocessor, for grid_kernel's registers
 constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared blocks need
 
+// The i-th slot that is held here. Slots have the same number on all ranks, which list their own.
+template <typename T>
+__device__ int64_t held_slot(const SolverView<T>& s, int64_t i) {
+  return s.peers == nullptr ? i : s.slot_next[i];
+}
+
 // Reads the sums of one node.
 template <typename T>
 __device__ NodeSums<T> read_sums(const SolverView<T>& s, int64_t node) {
@@ -97,12 +103,12 @@ __device__ __forceinline__ void book(const SolverView<T>& s, HeldSums& held, int
   }
 }
 
-// Velocity after the colliders in `near`, for all lanes of a warp together (`near` is the same in
-// all). Out of line: few nodes come here.
+// Velocity after the colliders in `near`, for all lanes of a warp together (`near` and `answers`
+// are the same in all; without the latter nothing is booked). Out of line: few nodes come here.
 template <typename T, bool kPoints>
 __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& held, uint64_t near,
-                                             bool active, Vec3<T> x, double mass, int32_t cut,
-                                             Vec3<T> v, T dt) {
+                                             bool answers, bool active, Vec3<T> x, double mass,
+                                             int32_t cut, Vec3<T> v, T dt) {
   for (; near != 0; near &= near - 1) {
     const int64_t first = __ffsll(static_cast<long long>(near)) - 1;
     const int64_t end = first == 63 ? s.collider_count : first + 1;  // bit 63: all the others
@@ -110,7 +116,7 @@ __device__ __noinline__ Vec3<T> collide_near(const SolverView<T>& s, HeldSums& h
       double sums[kImpulseSums] = {};
       if (active && (!kPoints || holds_node(s, k, x)))
         node_collide(s, k, x, mass, cut, dt, v, sums);
-      if (!__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
+      if (!answers || !__any_sync(kAllLanes, sums[6] != 0.0)) continue;  // none touches
       book(s, held, k, sums);
     }
   }
@@ -294,6 +300,7 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   const int32_t* block = s.slot_coord + 4 * int64_t(slots[0]);
   const Vec3<T> x = node_place(block, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
   const uint64_t near = s.collider_count > 0 ? s.slot_near[slots[0]] : 0;
+  const bool answers = s.answers(slots[0]);
   Vec3<T> velocity[kSiteFields];
   bool heavy[kSiteFields];
   int present = 0;
@@ -317,8 +324,9 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   for (int f = 0; f < count; ++f) {
     const int64_t node = int64_t(slots[f]) * kBlockNodes + local;
     if (near != 0)
-      velocity[f] = collide_near<T, kPoints>(s, held, near, heavy[f], x, read_sums(s, node).mass,
-                                             node_cut(s, count, heavy, number, f), velocity[f], dt);
+      velocity[f] =
+          collide_near<T, kPoints>(s, held, near, answers, heavy[f], x, read_sums(s, node).mass,
+                                   node_cut(s, count, heavy, number, f), velocity[f], dt);
     if constexpr (!kPoints) store_velocity(s.node_velocity, node, velocity[f]);
   }
   if constexpr (kPoints) {
@@ -326,7 +334,7 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
       rub_near(s, held, count, heavy, number, mass, node_of, x, velocity);
     for (int f = 0; f < count; ++f) store_velocity(s.node_velocity, node_of(f), velocity[f]);
   }
-  if (touched > 0) add_units(&s.clock->touched, 1);  // nodes, not pairs
+  if (touched > 0 && answers) add_units(&s.clock->touched, 1);  // nodes, not pairs
 }
 
 template <typename T, bool kPoints>
@@ -356,7 +364,7 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
   if constexpr (kPoints) given = s.slot_given[slot];
   const NodeSums<T> sums = read_all<T, kPoints>(s, node, given);
   clear_sums(s, node, shared);
-  if (shared == 1) {
+  if (shared == 1 || !s.needs(slot)) {
     if constexpr (kPoints) clear_given(s, node, given);
     return;
   }
@@ -367,7 +375,7 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
     const Vec3<T> x =
         node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
     const int32_t cut = s.cut_of(s.slot_coord[4 * slot + 3]);
-    v = collide_near<T, kPoints>(s, held, near, heavy, x, sums.mass, cut, v, dt);
+    v = collide_near<T, kPoints>(s, held, near, s.answers(slot), heavy, x, sums.mass, cut, v, dt);
   }
   if constexpr (kPoints) {
     if ((given & kPushed) != 0) {
@@ -397,7 +405,7 @@ __global__ void __launch_bounds__(kSolverThreads, kGridCtas)
   // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
   const int64_t home = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
   if (home < clock.homes) s.home_bound[home] = T(0);
-  if (slot < clock.slots) update_slot<T, kPoints>(s, held, slot);
+  if (slot < clock.slots) update_slot<T, kPoints>(s, held, held_slot(s, slot));
   if (s.collider_count > 0) held.hand_over(s);
 }
 

@@ -19,10 +19,22 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
 template <typename T>
 cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream);
 
-// Parts of these, by what a scene has.
-// Points that keep a share of their own motion: the pass without forces before a step, and g2p.
+// Parts of these, between which several ranks wait for each other (cuda/ranks/ranks.h): points to
+// nodes, without and with what acts on them; nodes, and nodes to points. One rank's step ends with
+// that; what several told makes its end.
 template <typename T>
-void solver_free(const SolverView<T>& s, cudaStream_t stream);
+void solver_free_to_nodes(const SolverView<T>& s, cudaStream_t stream);
+template <typename T>
+void solver_free_nodes(const SolverView<T>& s, cudaStream_t stream);
+template <typename T>
+void solver_to_nodes(const SolverView<T>& s, cudaStream_t stream);
+template <typename T>
+void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream);
+template <typename T>
+void solver_end(const SolverView<T>& s, cudaStream_t stream);
+
+// Parts by what a scene has.
+// Points that keep a share of their own motion: g2p (solver_free_to_nodes came before).
 template <typename T>
 void solver_keep(const SolverView<T>& s, int law_set, cudaStream_t stream);
 // Points that are pushed: what of their rows a step needs, and what they get in one.

@@ -1,9 +1,10 @@
 // CUDA back end of the resident solver: enqueues rounds of (blocks if wanted, then steps). Nothing
 // here waits for the device; the clock says afterwards what happened.
 #include <cstring>
+#include <map>
 #include <mutex>
 
-#include "cuda/solver/launch.h"
+#include "cuda/ranks/ranks.h"
 #include "cuda/stream.h"
 #include "host/solver.h"
 
@@ -69,9 +70,94 @@ class Round {
   int64_t steps_ = 0;
 };
 
+// The ranks with their devices for one call: the views know each other, the devices may reach each
+// other's memory, and each works in the stream that is torch's there.
+template <typename T>
+class Ranks {
+ public:
+  // `views` and one tensor of each on its device; the last are of all.
+  Ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like)
+      : views_(std::move(views)) {
+    for (const Tensor& t : like) device_.push_back(t.get_device_index());
+    for (const int d : device_)
+      for (const int other : device_) reach(d, other);
+    for (size_t r = 0; r < views_.size(); ++r) {
+      views_[r].rank = static_cast<int32_t>(r);
+      void* stream = nullptr;
+      TORCH_ERROR_CODE_CHECK(aoti_torch_get_current_cuda_stream(device_[r], &stream));
+      stream_.push_back(static_cast<cudaStream_t>(stream));
+      event_.push_back(event_on(device_[r]));
+    }
+    for (size_t r = 0; r < views_.size(); ++r) {
+      check_cuda("solver_ranks", cudaSetDevice(device_[r]));
+      check_cuda("solver_ranks", cudaMemcpyAsync(const_cast<SolverView<T>*>(views_[r].peers),
+                                                 views_.data(), views_.size() * sizeof views_[0],
+                                                 cudaMemcpyHostToDevice, stream_[r]));
+    }
+    const cuda::Fleet<T> all = fleet();
+    check_cuda("solver_ranks", all.meet());
+  }
+
+  cuda::Fleet<T> fleet() const {
+    return {static_cast<int>(views_.size()) - 1, views_.data(), device_.data(), stream_.data(),
+            event_.data()};
+  }
+
+ private:
+  static void reach(int device, int other) {
+    if (device == other) return;
+    int can = 0;
+    check_cuda("solver_ranks", cudaDeviceCanAccessPeer(&can, device, other));
+    STD_TORCH_CHECK(can != 0, "solver: device cuda:", device,
+                    " cannot reach the memory of cuda:", other,
+                    "; name devices of one host that are linked (nvidia-smi topo -p2p r)");
+    check_cuda("solver_ranks", cudaSetDevice(device));
+    const cudaError_t error = cudaDeviceEnablePeerAccess(other, 0);
+    if (error == cudaErrorPeerAccessAlreadyEnabled)
+      cudaGetLastError();
+    else
+      check_cuda("solver_ranks", error);
+  }
+  static cudaEvent_t event_on(int device) {
+    static std::map<int, cudaEvent_t> events;
+    static std::mutex mutex;
+    const std::lock_guard<std::mutex> lock(mutex);
+    cudaEvent_t& event = events[device];
+    if (event == nullptr) {
+      check_cuda("solver_ranks", cudaSetDevice(device));
+      check_cuda("solver_ranks", cudaEventCreateWithFlags(&event, cudaEventDisableTiming));
+    }
+    return event;
+  }
+
+  std::vector<SolverView<T>> views_;
+  std::vector<int> device_;
+  std::vector<cudaStream_t> stream_;
+  std::vector<cudaEvent_t> event_;
+};
+
 struct SolverCuda {
   using Scope = CudaScope;
   static constexpr bool kHasRanks = false;
+  template <typename T>
+  static void move_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,
+                         bool back) {
+    const Ranks<T> ranks(std::move(views), like);
+    check_cuda("solver_move_ranks",
+               back ? cuda::ranks_gather(ranks.fleet()) : cuda::ranks_load(ranks.fleet()));
+  }
+  template <typename T>
+  static void run_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,
+                        int law_set, int64_t rounds, int64_t steps) {
+    const Ranks<T> ranks(std::move(views), like);
+    const cuda::Fleet<T> fleet = ranks.fleet();
+    for (int64_t round = 0; round < rounds; ++round) {
+      check_cuda("solver_run_ranks", cuda::ranks_build(fleet));
+      for (int64_t i = 0; i < steps; ++i)
+        check_cuda("solver_run_ranks", cuda::ranks_step(fleet, law_set));
+    }
+    check_cuda("solver_run_ranks", fleet.meet());
+  }
   template <typename T>
   static void prime(const SolverView<T>& s, int law_set, const Scope& scope) {
     check_cuda("solver_prime", cuda::solver_prime(s, law_set, scope.stream()));

@@ -125,6 +125,22 @@ struct ParticleGiven {
   }
 };
 
+// Adds the words of one node, times 2^shift, to `kWords` sums of it: on this rank, and on all
+// others that hold its slot (sums(view) = their array).
+template <int kWords, typename T, typename Units, typename Sums>
+__device__ __forceinline__ void give_node(const SolverView<T>& s, int64_t node, const Units& units,
+                                          const Sums& sums) {
+  uint64_t others = 0;
+  if (s.peers != nullptr) others = s.holders[node / kBlockNodes] & ~(uint64_t(1) << s.rank);
+  for (int c = 0; c < kWords; ++c) {
+    const long long v = units(c);
+    if (v == 0) continue;
+    add_units(sums(s) + kWords * node + c, v);
+    for (uint64_t left = others; left != 0; left &= left - 1)
+      add_units(sums(s.peers[__ffsll(static_cast<long long>(left)) - 1]) + kWords * node + c, v);
+  }
+}
+
 // One home, or part of it. Where its window touches blocks that fields share, moments are summed
 // too. kFree: without the forces, from `own`.
 template <typename T, bool kMoments, bool kFree = false>
@@ -181,8 +197,6 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
     if (r < count) given.template read<kFree>(s, first + r);
   }
   __syncthreads();
-  int64_t* sums = static_cast<int64_t*>(s.sums);
-  int64_t* moments = static_cast<int64_t*>(s.moments);
   const int momentum_shift = units.momentum_shift, mass_shift = units.mass_shift;
   for (int index = threadIdx.x; index < kWindowNodes; index += kP2GThreads) {
     int i, j, k;
@@ -193,17 +207,15 @@ __device__ __forceinline__ void p2g_home(const SolverView<T>& s, int64_t home, i
     if (any == 0) continue;
     const int64_t node = slot_node(neighbour, i, j, k);
     if (node < 0) continue;
-    for (int c = 0; c < 4; ++c) {
-      const long long v = to_units(tile[c][at], c < 3 ? momentum_shift : mass_shift);
-      if (v != 0) add_units(sums + 4 * node + c, v);
-    }
+    give_node<4>(
+        s, node, [&](int c) { return to_units(tile[c][at], c < 3 ? momentum_shift : mass_shift); },
+        [](const SolverView<T>& v) { return static_cast<int64_t*>(v.sums); });
     if constexpr (kMoments) {
       // Only shared slots: nobody would clear the moments of the others.
       if (slot_shared[neighbour_of(i, j, k)])
-        for (int c = 0; c < kContactMoments; ++c) {
-          const long long v = to_units(tile[4 + c][at], mass_shift);
-          if (v != 0) add_units(moments + kContactMoments * node + c, v);
-        }
+        give_node<kContactMoments>(
+            s, node, [&](int c) { return to_units(tile[4 + c][at], mass_shift); },
+            [](const SolverView<T>& v) { return static_cast<int64_t*>(v.moments); });
     }
   }
 }

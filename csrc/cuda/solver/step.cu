@@ -33,6 +33,68 @@ __global__ void __launch_bounds__(kThreads)
     choose_unit(*s.clock);
 }
 
+// Of several ranks: the maxima and sums of all are this one's, and the step ends. One warp.
+template <typename T>
+__global__ void end_kernel(const __grid_constant__ SolverView<T> s) {
+  SolverClock& clock = *s.clock;
+  if (!may_step(clock)) return;
+  __shared__ int64_t all[kMailWords];
+  const int64_t words = kMailWords + s.collider_count * kImpulseSums;
+  for (int64_t i = threadIdx.x; i < words; i += 32) {
+    int64_t most = 0, sum = 0;
+    for (int q = 0; q < s.ranks; ++q) {
+      const int64_t told = s.peers[q].mail[i];
+      most = max(most, told);
+      sum += told;
+    }
+    if (i < kMailWords)
+      all[i] = i <= kMailBound ? most : sum;
+    else
+      s.impulse_units[i - kMailWords] = sum;
+  }
+  __syncwarp();
+  if (threadIdx.x == 0) {
+    clock.speed = static_cast<uint64_t>(all[kMailSpeed]);
+    clock.wave = static_cast<uint64_t>(all[kMailWave]);
+    clock.gradient = static_cast<uint64_t>(all[kMailGradient]);
+    clock.bound = static_cast<uint64_t>(all[kMailBound]);
+    if (s.rank == s.ranks) {  // the clock of all counts; those of the ranks have told
+      clock.plastic += all[kMailPlastic];
+      clock.guarded += all[kMailGuarded];
+      clock.inverted += all[kMailInverted];
+      clock.invalid += all[kMailInvalid];
+    }
+    clock.touched = all[kMailTouched];
+    clock.lost = all[kMailLost];
+    clock.leaving = all[kMailLeaving];
+  }
+  __threadfence();
+  __syncwarp();
+  end_of_step(s);
+}
+
+// A rank tells what its step was like.
+template <typename T>
+__global__ void tell_kernel(const __grid_constant__ SolverView<T> s) {
+  SolverClock& c = *s.clock;
+  if (!may_step(c)) return;
+  for (int64_t i = threadIdx.x; i < s.collider_count * kImpulseSums; i += 32)
+    s.mail[kMailWords + i] = s.impulse_units[i];
+  if (threadIdx.x != 0) return;
+  s.mail[kMailSpeed] = static_cast<int64_t>(c.speed);
+  s.mail[kMailWave] = static_cast<int64_t>(c.wave);
+  s.mail[kMailGradient] = static_cast<int64_t>(c.gradient);
+  s.mail[kMailBound] = static_cast<int64_t>(c.bound);
+  s.mail[kMailPlastic] = c.plastic;
+  s.mail[kMailGuarded] = c.guarded;
+  s.mail[kMailInverted] = c.inverted;
+  s.mail[kMailInvalid] = c.invalid;
+  s.mail[kMailTouched] = c.touched;
+  s.mail[kMailLost] = c.lost;
+  s.mail[kMailLeaving] = c.leaving;
+  c.plastic = c.guarded = c.inverted = c.invalid = 0;
+}
+
 }  // namespace
 
 template <typename T>
@@ -50,15 +112,16 @@ cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t strea
 }
 
 template <typename T>
-cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream) {
-  const unsigned homes = static_cast<unsigned>(s.home_capacity);
+void solver_to_nodes(const SolverView<T>& s, cudaStream_t stream) {
   const int shift = split_shift(s);
-  const unsigned ctas = homes << shift;
-  if (s.own != nullptr) solver_free(s, stream);
-  if (s.radius != nullptr) solver_points(s, stream);
+  const unsigned ctas = static_cast<unsigned>(s.home_capacity) << shift;
   p2g_kernel<T><<<ctas, kP2GThreads, 0, stream>>>(s, shift);
   if (s.moments != nullptr)
     p2g_shared_kernel<T><<<min(ctas, kSharedCtas), kP2GThreads, 0, stream>>>(s, shift);
+}
+
+template <typename T>
+void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream) {
   if (s.radius != nullptr)
     launch_nodes<T, true>(s, stream);
   else
@@ -77,11 +140,31 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     launch_g2p<T, kMoreLaws, false>(s, stream);
   else
     launch_g2p<T, kAnyLaw, false>(s, stream);
+  if (s.peers != nullptr) tell_kernel<T><<<1, 32, 0, stream>>>(s);
+}
+
+template <typename T>
+void solver_end(const SolverView<T>& s, cudaStream_t stream) {
+  end_kernel<T><<<1, 32, 0, stream>>>(s);
+}
+
+template <typename T>
+cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream) {
+  if (s.own != nullptr) {
+    solver_free_to_nodes(s, stream);
+    solver_free_nodes(s, stream);
+  }
+  if (s.radius != nullptr) solver_points(s, stream);
+  solver_to_nodes(s, stream);
+  solver_from_nodes(s, law_set, stream);
   return cudaGetLastError();
 }
 
 #define GSF_INSTANTIATE(T)                                                       \
   template cudaError_t solver_prime<T>(const SolverView<T>&, int, cudaStream_t); \
+  template void solver_to_nodes<T>(const SolverView<T>&, cudaStream_t);          \
+  template void solver_from_nodes<T>(const SolverView<T>&, int, cudaStream_t);   \
+  template void solver_end<T>(const SolverView<T>&, cudaStream_t);               \
   template cudaError_t solver_step<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

@@ -1,0 +1,144 @@
+"""Several ranks of the resident solver on CUDA: what each holds, and where.
+
+See docs/theory/ranks.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsfluent.errors import InputError
+from gsfluent.ops import solver_buffers as layout
+
+MOST_RANKS = 64
+"""``kMostRanks`` of ``csrc/host/solver.h``."""
+VIEW_BYTES = 1024
+"""``kViewBytes`` of it."""
+MAIL_WORDS = 11
+"""``kMailWords`` of ``csrc/core/solver/state.h``."""
+
+_POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
+           "place", "viscous", "own")  # fmt: skip
+_MOVING = ("colliders", "collider_state", "impulse")
+_STATIC = ("law", "rows", "sdf", "parent", "cut")
+
+
+def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> list[torch.device]:
+    """The devices of the ranks, one each, checked.
+
+    Raises:
+        InputError: One that is no CUDA device or not there; ``home``, where the points lie, is not
+            among them.
+    """
+    there = torch.cuda.device_count()
+    found = []
+    for name in devices:
+        try:
+            device = torch.device(name)
+        except RuntimeError as error:
+            raise InputError(
+                f"Solver: devices: {name!r} is no device", hint='name them, as in "cuda:0"'
+            ) from error
+        if device.type != "cuda":
+            raise InputError(
+                f"Solver: devices must be CUDA devices, got {device}",
+                hint="ranks=N cuts a scene on a CPU",
+            )
+        index = torch.cuda.current_device() if device.index is None else device.index
+        if index >= there:
+            raise InputError(
+                f"Solver: devices: cuda:{index} is not there; this machine has {there}",
+                hint="nvidia-smi lists them; CUDA_VISIBLE_DEVICES may hide some",
+            )
+        found.append(torch.device("cuda", index))
+    if not found:
+        raise InputError("Solver: devices is empty", hint="leave it out: one device does all")
+    if len(found) > MOST_RANKS:
+        raise InputError(
+            f"Solver: devices: at most {MOST_RANKS}, got {len(found)}", hint="name fewer"
+        )
+    if home not in found:
+        raise InputError(
+            f"Solver: the points lie on {home}, which is none of devices",
+            hint=f"name it too, or move position and the others to {found[0]}",
+        )
+    return found
+
+
+class Parts:
+    """Buffers of every rank, on its device; those of all are the solver's own.
+
+    Args:
+        whole: Buffers of all, which get what only ranks need.
+        devices: Device of each rank.
+        fields: Velocity fields.
+    """
+
+    def __init__(self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int) -> None:
+        self.whole, self.devices, self.fields = whole, tuple(devices), fields
+        self._equip(whole)
+        self.parts = [self._part(device) for device in devices]
+
+    def _equip(self, b: layout.Buffers) -> None:
+        """Room for what ranks need beside the rest."""
+        device = b.offset.device
+        words = MAIL_WORDS + layout.IMPULSE_SUMS * self.whole.impulse.shape[0]
+        b.mail = torch.zeros(words, dtype=torch.int64, device=device)
+        room = VIEW_BYTES * (len(self.devices) + 1)
+        b.peers = torch.zeros(room, dtype=torch.uint8, device=device)
+        b.reserve_ranks()
+
+    def _part(self, device: torch.device) -> layout.Buffers:
+        whole = self.whole
+        part = dataclasses.replace(whole)
+        for field in dataclasses.fields(whole):
+            value = getattr(whole, field.name)
+            if field.name in _STATIC:
+                new = value.to(device)
+            elif field.name in (*_POINTS, *_MOVING, "clock", "impulse_units"):
+                new = torch.zeros_like(value, device=device)
+            else:
+                new = value.new_zeros((0, *value.shape[1:]), device=device)
+            setattr(part, field.name, new)
+        part.home_start0 = part.home_start0.new_zeros(0)
+        part.reserve_blocks(whole.home_start0.shape[0], whole.slot_next.shape[0], self.fields)
+        self._equip(part)
+        return part
+
+    def listed(self) -> list[Tensor]:
+        """The buffers of one rank after the other."""
+        return [tensor for part in self.parts for tensor in part.listed()]
+
+    def begin(self) -> None:
+        """Tell the ranks what may have changed since the last call."""
+        for part in self.parts:
+            for name in _MOVING:
+                getattr(part, name).copy_(getattr(self.whole, name))
+            part.impulse_units.zero_()
+
+    def grow(self, homes: int, slots: int) -> None:
+        """Make room for more blocks on every rank; ``whole`` has it already."""
+        for part in self.parts:
+            part.reserve_blocks(homes, slots, self.fields)
+            part.clock[layout.INDEX["grow"]] = 0
+
+    def memory(self) -> int:
+        """Return the bytes of all tensors of the ranks."""
+        return sum(part.memory() for part in self.parts)
+
+    def counts(self) -> list[dict[str, int]]:
+        """Points, homes, slots and shared slots of each rank."""
+        rows = []
+        for rank, part in enumerate(self.parts):
+            clock = part.clock.cpu()
+            points, homes, slots = (
+                int(clock[layout.INDEX[name]]) for name in ("cursor", "homes", "slots")
+            )
+            holders = part.holders[part.slot_next[:slots].long()]
+            shared = int((holders != torch.ones_like(holders) << rank).sum())
+            rows.append({"points": points, "homes": homes, "slots": slots, "shared": shared})
+        return rows

@@ -1,0 +1,170 @@
+"""Several ranks on CUDA, in lockstep on one device and one on each: the bits of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from solver_scenes import scene
+from test_solver_cpu import STATE, shuffled, small
+from test_solver_ranks import CASES, DTYPES, dust
+
+from gsfluent import has_cuda, ops
+from gsfluent.errors import InputError
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not has_cuda(), reason="needs a GPU and gsfluent's CUDA kernels"),
+]
+STEPS = 40
+UNKNOWN = ("radius", "objects", "objects on each other")
+"""Cases that ranks on CUDA refuse."""
+KNOWN = [name for name in CASES if name not in (*UNKNOWN, "metal with a rate")]
+PEERS = 4
+"""Devices used at most."""
+
+
+def devices() -> list[str]:
+    """Two devices or more of this host, or a skip that says how many there are."""
+    there = torch.cuda.device_count()
+    if there < 2:
+        pytest.skip(f"needs two GPUs of one host, this one has {there}")
+    return [f"cuda:{i}" for i in range(min(there, PEERS))]
+
+
+def here(given: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: value.to("cuda:0") if isinstance(value, torch.Tensor) else value
+        for name, value in given.items()
+    }
+
+
+def run(given: dict[str, Any], steps: int = STEPS, **options: Any) -> ops.Solver:
+    solver = ops.Solver(**given, **options)
+    solver.advance(steps=steps)
+    return solver
+
+
+def assert_equal(have: ops.Solver, want: ops.Solver) -> None:
+    for name in STATE:
+        value = getattr(want, name)
+        if value is not None:
+            assert torch.equal(getattr(have, name), value), name
+    assert torch.equal(have.impulse, want.impulse)
+    assert torch.equal(have.torque, want.torque)
+    assert torch.equal(have.colliders, want.colliders)
+    assert have.counters() == want.counters()
+    assert have.time == want.time and have.dt == want.dt
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("name", KNOWN)
+def test_ranks_on_one_device_give_the_bits_of_one(name: str, dtype: torch.dtype) -> None:
+    given = here(CASES[name](dtype))
+    one = run(given)
+    for ranks in (2, 3, 4):
+        several = run(given, ranks=ranks)
+        assert_equal(several, one)
+        parts = several.rank_counts()
+        assert sum(part["points"] for part in parts) == one.count
+        assert sum(part["points"] > 0 for part in parts) > 1
+        assert sum(part["shared"] for part in parts) > 0
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_several_devices_give_the_bits_of_one(name: str) -> None:
+    given = here(CASES[name](torch.float32))
+    assert_equal(run(given, devices=devices()), run(given))
+
+
+@pytest.mark.parametrize("points", [599_000, 601_000])
+def test_a_body_of_many_homes_through_many_builds(points: int) -> None:
+    """Below 600 000 points two CTAs share a home."""
+    given = here(scene(cells=43, dtype=torch.float32))
+    for name, value in given.items():
+        if isinstance(value, torch.Tensor) and value.shape[0] > points:
+            given[name] = value[:points]
+    one = run(given, 200)
+    assert one.counters()["builds"] > 1
+    assert_equal(run(given, 200, ranks=4), one)
+    if torch.cuda.device_count() > 1:
+        assert_equal(run(given, 200, devices=devices()), one)
+
+
+def test_a_thousand_steps_on_several_devices() -> None:
+    given = here(scene(cells=24, bodies=2, laws=(0, 1), dtype=torch.float32, track=True))
+    assert_equal(run(given, 1000, devices=devices()), run(given, 1000))
+
+
+@pytest.mark.parametrize("parent", [[0, 1, 2], [0, 0, 1], [0, 0, 0]], ids=str)
+def test_sparse_points_that_drift_keep_the_bits(parent: list[int]) -> None:
+    given = dust(torch.float32, 1)
+    given["parent"] = torch.tensor(parent, dtype=torch.int32)
+    given["cut"] = torch.zeros(3, dtype=torch.int32)
+    given = here(given)
+    one = run(given, 50)
+    for ranks in (2, 7, 64):
+        assert_equal(run(given, 50, ranks=ranks), one)
+
+
+def test_order_of_points_and_room_for_blocks_leave_no_trace() -> None:
+    given = scene(cells=8, bodies=2, laws=(0, 1), dtype=torch.float32)
+    mixed, order = shuffled(given)
+    one = run(here(given), 20)
+    several = run(here(mixed), 20, ranks=5)
+    assert torch.equal(several.position, one.position[order.cuda()])
+    assert torch.equal(several.impulse, one.impulse)
+    tight = ops.Solver(**here(given), ranks=3)
+    homes = int(tight.clock()["homes"])
+    tight._buffers.reserve_blocks(homes, 1, 2)
+    tight._parts.grow(homes, 1)
+    start = tight.snapshot()
+    for _ in range(2):
+        tight.advance(steps=20)
+        assert torch.equal(tight.position, one.position)
+        tight.restore(start)
+
+
+def test_a_time_is_met_in_one_call_or_in_two() -> None:
+    given = here(small("two bodies", torch.float32))
+    one, several = ops.Solver(**given), ops.Solver(**given, ranks=3)
+    for until in (0.004, 0.01):
+        one.advance(until=until)
+        several.advance(until=until)
+        assert_equal(several, one)
+
+
+def test_the_same_failure_at_the_same_step() -> None:
+    given = here(small("two bodies", torch.float32))
+    told = []
+    for ranks in (1, 4):
+        with pytest.raises(ops.SolverError) as failure:
+            run(given, ranks=ranks, dt=6e-3)
+        told.append(str(failure.value))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_ranks_on_cuda_do_not_know_is_refused_by_name(name: str) -> None:
+    with pytest.raises(InputError, match="2 ranks do not know radius on CUDA yet"):
+        ops.Solver(**here(CASES[name](torch.float32)), ranks=2)
+
+
+@pytest.mark.parametrize(
+    "named, why",
+    [
+        (["cuda:0", "cuda:99"], "cuda:99 is not there; this machine has"),
+        (["cpu"], "must be CUDA devices"),
+        (["moon"], "'moon' is no device"),
+        ([], "devices is empty"),
+    ],
+)
+def test_devices_that_are_none_are_refused(named: list[str], why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        ops.Solver(**here(small("elastic", torch.float32)), devices=named)
+
+
+def test_points_must_lie_on_one_of_the_devices() -> None:
+    with pytest.raises(InputError, match="the points lie on cuda:0"):
+        ops.Solver(**here(small("elastic", torch.float32)), devices=devices()[1:])
