@@ -70,8 +70,9 @@ def viscous_step(
 
     A yield goes ``dt / (T + dt)`` of the way that the law says (Duvaut and Lions 1976). The spring
     of the Maxwell branch relaxes for half of the step, goes along with ``increment``, and relaxes
-    for the rest (second order in dt / tau). Where the law yields it keeps as much of its strain as
-    the law of its stress. Both are stable for any step. Simo and Hughes 1998, ch. 2.7 and 10.
+    for the rest (second order in dt / tau). Of brittle matter it goes back onto the yield surface
+    as a state of the law would, and moves it no further. Both are stable for any step. Simo and
+    Hughes 1998, ch. 2.7 and 10.
 
     Args:
         viscous: Of each point, [N, 9]: strain of its spring (as ``strain``), its share g of the
@@ -106,24 +107,30 @@ def viscous_step(
         return strain, stress
 
     after, new_alpha, stress = returned
-    left = torch.ones_like(share)
+    way = torch.ones_like(share)
     if bool((law == LAWS["nacc"]).any()):
         trial, trial_stress = elastic(strain, increment)
+        way = torch.where(time > 0, dt / (time + dt).clamp(min=1e-30), 1.0)
         late = (stress != trial_stress).any(dim=1, keepdim=True) & (time > 0)
-        way = torch.where(late, dt / (time + dt).clamp(min=1e-30), 1.0)
         slow, slow_stress = elastic((1.0 - way) * trial + way * after, none)
         after, stress = torch.where(late, slow, after), torch.where(late, slow_stress, stress)
-        new_alpha = torch.where(late[:, 0], alpha + way[:, 0] * (new_alpha - alpha), new_alpha)
-        yields = (stress != trial_stress).any(dim=1, keepdim=True)
-        ratio = _norm2(stress) / _norm2(trial_stress).clamp(min=1e-30)
-        left = torch.where(yields, ratio.sqrt().clamp(max=1.0), left)
+        slow_alpha = alpha + way[:, 0] * (new_alpha - alpha)
+        new_alpha = torch.where(late[:, 0], slow_alpha, new_alpha)
     row = params if material is None else params[material.long()]
     modulus = row[:, 1:2] + 4.0 / 3.0 * row[:, :1]
     y = 0.5 * dt * rate.clamp(min=0.0)
     half = 1.0 / (1.0 + y * (1.0 + 0.5 * y))
-    left = left * _kept_by_unloading(rate, stress, increment, modulus, dt)
+    left = _kept_by_unloading(rate, stress, increment, modulus, dt)
     spring = left * half * elastic(half * viscous[:, :6], increment)[0]
     spring, held = elastic(spring, none)
+    if bool((law == LAWS["nacc"]).any()):  # onto the surface where it is, which stays there
+        inside, _, inside_stress, _ = return_mapping(
+            spring, new_alpha, none, law=law, params=params, material=material, implicit=False,
+            dt=INSTANT,
+        )  # fmt: skip
+        beyond = (inside_stress != held).any(dim=1, keepdim=True)
+        back, back_stress = elastic((1.0 - way) * spring + way * inside, none)
+        spring, held = torch.where(beyond, back, spring), torch.where(beyond, back_stress, held)
     spring = torch.where(share > 0, spring, viscous[:, :6])
     stress = torch.where(share > 0, (1.0 - share) * stress + share * held, stress)
     return torch.cat([spring, viscous[:, SHARE:]], dim=1), after, new_alpha, stress

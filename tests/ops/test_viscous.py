@@ -159,6 +159,42 @@ def test_what_breaks_lets_go_of_its_spring() -> None:
     assert all(torch.equal(a, b) for a, b in zip(one, two, strict=True))
 
 
+@given(st.integers(0, 10**6))
+def test_a_spring_that_never_relaxes_is_not_there(seed: int) -> None:
+    """Whatever yields, pulled, pressed or sheared: stress and spring are those of the law."""
+    _, _, move = some(seed, 16, 4e-3)
+    none = torch.zeros(16, 6, dtype=torch.float64)
+    strain, viscous, table = none, branch(0.8, 0.0, 16), rows(NACC)
+    alpha = torch.linspace(-0.05, 0.1, 16, dtype=torch.float64)
+    for turn in (1.0, 1.0, -1.0, -1.0, -1.0, 1.0):
+        returned = ops.return_mapping(strain, alpha, turn * move, dt=1e-3, **table)[:3]
+        viscous, strain, alpha, stress = ops.viscous_step(
+            viscous, strain, alpha, turn * move, returned, dt=1e-3, **table
+        )
+        assert torch.allclose(stress, returned[2], rtol=1e-9, atol=1e-9 * YOUNG)
+        assert torch.allclose(viscous[:, :6], strain, rtol=1e-9, atol=1e-12)
+
+
+def test_a_spring_that_relaxed_while_it_was_pressed_pulls_with_no_more_than_the_strength() -> None:
+    share, beta = 0.95, 0.6
+    strength = beta * KAPPA * (1e-5 + math.sinh(3.0 * 0.05))  # rows, alpha of -0.05
+    viscous, table = branch(share, 1e4), rows(NACC)
+    strain = torch.zeros(1, 6, dtype=torch.float64)
+    alpha = torch.full((1,), -0.05, dtype=torch.float64)
+    squeeze = -1e-3 * torch.eye(3, dtype=torch.float64)[None]
+    stresses = []
+    for i in range(120):  # 40 steps to press it, 40 to hold it, 40 to let it go at once
+        moved = (0.0 if 40 <= i < 80 else 1.0 if i < 40 else -1.0) * squeeze
+        dt = 1e-4 if i < 80 else 1e-9
+        returned = ops.return_mapping(strain, alpha, moved, dt=dt, **table)[:3]
+        viscous, strain, alpha, stress = ops.viscous_step(
+            viscous, strain, alpha, moved, returned, dt=dt, **table
+        )
+        stresses.append(float(stress[0, :3].mean()))
+    assert float(alpha) == -0.05  # nothing broke
+    assert max(stresses) == pytest.approx(share * strength, rel=1e-3)
+
+
 def sheared(rate: float, time: float, dt: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """Shear stress over the steps of perfectly plastic matter, then strain and alpha.
 

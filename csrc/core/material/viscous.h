@@ -5,7 +5,7 @@
 // Definition: ops/viscous.py; equations: docs/theory/viscous.md.
 #pragma once
 
-#include "core/material/elastic.h"
+#include "core/material/nacc.h"
 
 namespace gsf {
 
@@ -56,11 +56,19 @@ GSF_HOST_DEVICE T yielding_share(T time, T dt) {
   return time > T(0) ? dt / (time + dt) : T(1);
 }
 
-// What is left of the spring where the law yields: as much as of the law's own stress.
+// The spring of brittle matter holds no more than the matter does: what of it lies beyond the yield
+// surface goes back onto it as a state of the law would, and moves it no further. So a spring with
+// the law's own strain keeps to it, one that never relaxes is not there, and what has broken cannot
+// be held together by springs that relaxed while it was pressed. False: it is inside.
+//   alpha   that of the law after its step
 template <typename T>
-GSF_HOST_DEVICE T kept_by_yield(const Sym3<T>& trial, const Sym3<T>& returned) {
-  using std::sqrt;
-  return min(sqrt(norm2(returned) / max(norm2(trial), T(1e-30))), T(1));
+GSF_HOST_DEVICE_COLD bool yield_spring(const NaccMaterial<T>& m, const NaccOptions<T>& o, T alpha,
+                                       ElasticState<T>& spring) {
+  const NaccOptions<T> still{o.k, o.epsilon, false};
+  const NaccState<T> found = nacc_return(m, still, spring, alpha);
+  spring.d = found.d;
+  spring.j2m1 = found.j2m1;
+  return found.plastic;
 }
 
 }  // namespace gsf

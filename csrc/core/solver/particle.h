@@ -225,33 +225,37 @@ GSF_HOST_DEVICE Sym3<T> kept_strain(const ElasticState<T>& state) {
 template <typename T>
 GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T* row,
                                       const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
-                                      T dt, ReturnMapped<T>& out) {
+                                      T dt, bool brittle, const MaterialRow<T>& m,
+                                      ReturnMapped<T>& out) {
   T own[kViscousColumns];
   load_nine(s, s.viscous, p, own);
   const T share = own[6];
-  T left = T(1);  // of the spring's strain
-  if (out.plastic) {
+  const T way = yielding_share(own[8], dt);
+  if (out.plastic && own[8] > T(0)) {
     const ElasticState<T> trial = elastic_state(update_strain(strain, increment), out.inverted);
-    if (own[8] > T(0)) {
-      const T way = yielding_share(own[8], dt);
-      out.strain = (T(1) - way) * kept_strain(trial) + way * out.strain;
-      out.alpha = alpha + way * (out.alpha - alpha);
-      const ElasticState<T> now = elastic_state(out.strain, false);
-      out.strain = kept_strain(now);
-      out.stress = kirchhoff_stress(row[0], row[1], now.d, now.j2m1);
-    }
-    left = kept_by_yield(kirchhoff_stress(row[0], row[1], trial.d, trial.j2m1), out.stress);
+    out.strain = (T(1) - way) * kept_strain(trial) + way * out.strain;
+    out.alpha = alpha + way * (out.alpha - alpha);
+    const ElasticState<T> now = elastic_state(out.strain, false);
+    out.strain = kept_strain(now);
+    out.stress = kirchhoff_stress(row[0], row[1], now.d, now.j2m1);
   }
   if (!(share > T(0))) return;
   Sym3<T> e{own[0], own[1], own[2], own[3], own[4], own[5]};
+  e = relaxed_strain(e, increment, half_decay(max(own[7], T(0)), dt));
   if (own[7] < T(0))
-    left *= kept_by_unloading(own[7], out.stress, increment, row[1] + T(4.0 / 3.0) * row[0], dt);
-  e = left * relaxed_strain(e, increment, half_decay(max(own[7], T(0)), dt));
+    e = kept_by_unloading(own[7], out.stress, increment, row[1] + T(4.0 / 3.0) * row[0], dt) * e;
   if (!finite(e)) {
     e = Sym3<T>{};
     out.invalid = true;
   }
-  const ElasticState<T> spring = elastic_state(e, out.inverted);
+  ElasticState<T> spring = elastic_state(e, out.inverted);
+  if (brittle) {
+    const NaccMaterial<T> nacc{m.mu, m.kappa, m.strength, m.cohesion, m.hardening, m.damage};
+    e = kept_strain(spring);
+    if (yield_spring(nacc, s.options, out.alpha, spring))
+      spring = elastic_state(
+          (T(1) - way) * e + way * strain_from_isochoric(spring.d, log_volume(spring)), false);
+  }
   store_spring(s, p, kept_strain(spring), own);
   out.stress =
       shared_stress(out.stress, kirchhoff_stress(row[0], row[1], spring.d, spring.j2m1), share);
@@ -374,7 +378,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
         law_step<T, kLaws>(before.strain, alpha, increment, law, material, s.options, dt);
     if constexpr (with_springs(kLaws))
       if (law == kElastic || law == kNacc)
-        viscous_particle(s, p, r, before.strain, alpha, increment, dt, out);
+        viscous_particle(s, p, r, before.strain, alpha, increment, dt, law == kNacc, material, out);
     flags.plastic = out.plastic;
     flags.guarded = out.guarded;
     flags.inverted = out.inverted;
@@ -472,7 +476,8 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
   if constexpr (with_springs(kLaws))
     if (s.law[row] == kElastic || s.law[row] == kNacc)
-      viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), state);
+      viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), s.law[row] == kNacc, material,
+                       state);
   if (loses && material.exponent > T(0))
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;

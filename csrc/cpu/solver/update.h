@@ -119,6 +119,8 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       loss = select<T>(phase, row[7], P(0));
     }
   }
+  [[maybe_unused]] Int brittle{};
+  [[maybe_unused]] P holding(0), state(0);  // cohesion and alpha of what is brittle
   if constexpr (kLaws != kElasticOnly) {
     Int nacc{}, elastic = phase;
     if (packet.same_rows()) {
@@ -159,6 +161,9 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       }
       plain &= ~nacc | softens | (holds & (alpha <= peak));
       loss = select<T>(nacc, row[7], loss);
+      brittle = nacc;
+      holding = cohesion;
+      state = alpha;
     }
   }
 
@@ -191,6 +196,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     plain &= ~relaxes |
              ((max_abs(spring) <= P(kStrainMax)) & (change >= P(kJMin * kJMin - 1.0)) &
               (change <= P(kJMax * kJMax - 1.0)) & (norm2(away) <= P(kDeviatorMax * kDeviatorMax)));
+    plain &= ~(relaxes & brittle) | surely_elastic(row, holding, state, change, norm2(away));
     stress = shared_stress(stress, add_diagonal(row[0] * away, P(0.5) * row[1] * change),
                            select<T>(relaxes, four[6], P(0)));
   }
