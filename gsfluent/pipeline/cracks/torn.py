@@ -67,23 +67,21 @@ class Shares(NamedTuple):
     def _enough(self) -> Tensor:
         return (self.many >= PART) | (self.piece == self.dust)
 
-    def parting(self, regions: int, bodies: int) -> tuple[list[int], list[int]]:
-        """Regions that must be divided, and chips that have become dust.
+    def parting(self, regions: int, bodies: int) -> list[int]:
+        """Regions that must be divided.
 
         Args:
             regions: Number of regions.
             bodies: The first so many are bodies that were whole; a small one is no chip.
         """
-        chunk, many, dusty = self.chunk, self.many, self.piece == self.dust
-        times = torch.bincount(chunk[self._enough], minlength=regions)
+        times = torch.bincount(self.chunk[self._enough], minlength=regions)
         size, lost = (torch.zeros_like(times) for _ in range(2))
-        size.index_add_(0, chunk, many)
-        lost.index_add_(0, chunk, torch.where(dusty, many, 0))
+        size.index_add_(0, self.chunk, self.many)
+        lost.index_add_(0, self.chunk, torch.where(self.piece == self.dust, self.many, 0))
         chip = size < CHIP
         chip[:bodies] = False
         torn = ((times > 1) | (lost > 0)) & ~chip
-        found = torch.stack([torn, chip & (2 * lost > size)]).cpu()
-        return found[0].nonzero()[:, 0].tolist(), found[1].nonzero()[:, 0].tolist()
+        return torn.nonzero()[:, 0].tolist()
 
     def torn(self, regions: list[int], rows: Tensor, rest: Tensor) -> list[Torn]:
         """What some regions fall into.
