@@ -42,7 +42,7 @@ from gsfluent.pipeline.partition.roughness import amplitude, relief
 from gsfluent.pipeline.partition.splits import Split, Splits
 from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.results.partition import SavedBody, SavedPartition, SavedSplit
-from gsfluent.spatial.neighbours import nearest_in_group, nearest_rows
+from gsfluent.spatial.neighbours import nearest_rows
 
 OPACITY = 0.97
 """Opacity of a face element where the gap is wide."""
@@ -111,20 +111,13 @@ class Chunks:
         self._links = self.base.links
         self._lent = Lent(self._owner[:0], self._owner[:0])
         torn: list[Torn] = []
-        done = list(state.get("splits", ()))
-        while done:
-            event = done.pop(0)
+        for event in state.get("splits", ()):
             step = int(event.get("frame", 0))
             known = {part.region for part in torn}
             alike = step == self._steps and int(event["region"]) not in known
-            if "melted" in event or not alike or int(event["region"]) >= self._regions:
+            if not alike or int(event["region"]) >= self._regions:
                 self._divide(torn)
                 torn, self._steps = [], step
-            if "melted" in event:
-                group = [event, *done[: int(event["melted"]) - 1]]
-                del done[: len(group) - 1]
-                self._melt([(int(e["region"]), e["rows"].to(device)) for e in group])
-                continue
             rows, rank = event["rows"].to(device), event["rank"].to(device).long()
             pieces, dust = int(rank.max()) + 1, int(event.get("dust", -1))
             torn.append(Torn(int(event["region"]), rows, rank, pieces, dust))
@@ -215,22 +208,17 @@ class Chunks:
         """Split regions whose points belong to several pieces, and see which points drive them.
 
         Dust is a piece of its own: one label for all of it in a region. A chip is not divided, it
-        goes with most of its points, or is dust when most of them are.
+        goes with most of its points; when they are dust, with all of them.
         """
         count = unit.shape[0]
         label = torch.where(unit < 0, count, unit)
         while True:
             counted = (self._may & ~self._gone).nonzero()[:, 0]
             shares = Shares.of(self._chunk[counted], label[counted], count)
-            torn, melted = shares.parting(self._regions, len(self._scene.bodies))
-            if not torn and not melted:
+            torn = shares.parting(self._regions, len(self._scene.bodies))
+            if not torn:
                 break
             self._divide(shares.torn(torn, counted, self.base.matter.rest))
-            if melted:
-                mine = counted[~self._gone[counted]]  # a split may have led its dust to a chip
-                mine = mine[torch.isin(self._chunk[mine], self._numbers(melted))]
-                of = self._chunk[mine]
-                self._melt([(region, mine[of == region]) for region in melted])
         chunk, piece, many = shares.chunk, shares.piece, shares.many
         # a region moves with the piece that most of its points belong to
         most = torch.zeros(self._regions, dtype=torch.int64, device=unit.device)
@@ -327,50 +315,6 @@ class Chunks:
             self._gone = self._gone.index_fill(0, rows, True)
             colors = functools.partial(colors_at, self._partition(body), self._solid(body))
             self._dust.add(rows, colors)
-
-    def _melt(self, chips: list[tuple[int, Tensor]]) -> None:
-        """Chips have become dust: regions, and the points of each. All at once: there are hundreds.
-
-        Nothing is cut anew: the voxels stay theirs.
-        """
-        for region, rows in chips:
-            rank = torch.zeros_like(rows, dtype=torch.int32)
-            event = {"region": region, "rows": rows, "rank": rank, "dust": 0}
-            self._events.append({**event, "frame": self._steps, "melted": len(chips)})
-        bodies = [int(body) for body in self._body[torch.stack([rows[0] for _, rows in chips])]]
-        for body in sorted(set(bodies)):
-            mine = [chip for chip, its in zip(chips, bodies, strict=True) if its == body]
-            thrown = torch.cat([rows for _, rows in mine])
-            ids = self._numbers([region for region, _ in mine])
-            of = ids.repeat_interleave(self._numbers([len(rows) for _, rows in mine]))
-            self._gone = self._gone.index_fill(0, thrown, True)
-            colors = functools.partial(colors_at, self._partitions[body], self._solid(body))
-            self._dust.add(thrown, colors)
-            within = torch.isin(self._chunk, ids)
-            firm = self._may & ~self._gone & (self._body == body) & ~within
-            self._led_by(within.nonzero()[:, 0], firm.nonzero()[:, 0])
-            splats = torch.isin(self._region, ids).nonzero()[:, 0]
-            near = self._thrown(self.base.gaussians.means[splats], self._region[splats], thrown, of)
-            self._ash = self._ash.index_copy(0, splats, near)
-            faces = self._faces
-            assert faces is not None  # a chip was cut off
-            burnt = torch.isin(faces.region, ids).nonzero()[:, 0]
-            near = self._thrown(faces.means[burnt], faces.region[burnt], thrown, of)
-            self._faces = dataclasses.replace(
-                faces,
-                owner=faces.owner.index_copy(0, burnt, near),
-                ash=faces.ash.index_copy(0, burnt, near),
-            )
-
-    def _thrown(self, places: Tensor, region: Tensor, rows: Tensor, of: Tensor) -> Tensor:
-        """Nearest of the points thrown by each place's own region, which has some."""
-        if places.shape[0] == 0:
-            return rows[:0]
-        rest, spacing = self.base.matter.rest, self.base.matter.spacing[int(self._body[rows[0]])]
-        return rows[nearest_in_group(rest[rows], of, places, region, 1, spacing)[1][:, 0]]
-
-    def _numbers(self, values: list[int]) -> Tensor:
-        return torch.tensor(values, dtype=torch.int64, device=self._chunk.device)
 
     def _partition(self, body: int) -> Partition:
         """The partition of a body, made when it first comes apart."""

@@ -1,11 +1,12 @@
 """Dust: material points that hang on nothing, each drawn as a cloud of fine grains.
 
 A point of dust is as large as the grid is fine, which no grain of the real thing is. So it is drawn
-as grains, as frequent as their size to the power -3.5 (Villermaux 2025), in the colours of the
-places that they come from, drops nearer to that of the flesh. Their volumes sum to that of
-the point. They leave with it: a point that has gone a way relative to the chunk that it came from
-has scattered its grains by a fifth of that. What is left behind is a pit in the chunk
-(:mod:`gsfluent.pipeline.cracks.chunks`). Drops that reach the floor spread on it.
+as chips with flat sides, as frequent as their size to the power -3.5 (Villermaux 2025), in the
+colours of the places that they come from, and as a puff of mist for what is too fine to be seen one
+by one: as opaque as its drops are, seen beside each other. They leave with it, and tumble: a point
+that has gone a way relative to the chunk that it came from has scattered its grains by a fifth of
+that, and its mist has grown. What is left behind is a pit in the chunk
+(:mod:`gsfluent.pipeline.cracks.chunks`).
 
 All that is random about a grain is hashed from the row of its point and its number, so it is the
 same in every frame, on every device and after a resume. A run without dust has no grains.
@@ -32,17 +33,22 @@ from gsfluent.scene.scene import Scene
 
 BETA = 3.5
 """Grains are as frequent as their size to the power of minus this, in solids."""
-FINEST, COARSEST = 1.0 / 8.0, 1.0 / 2.0
-"""Smallest and largest grain, in edges of a point."""
-SPLASH = 1.0
-"""Largest drop, in edges of a point: one size would look like beads."""
-DROP, GRAIN = 1.5e-3, 1.5e-3
-"""Smallest drop and grain of powder [m], whatever the grid: juice does not become mist. Where that
-is more than a point, only some of the points have one."""
-SHARE = 1.0 / 40.0
-"""Smallest grain, at most, as a share of the edge of a cube of the body's volume."""
-MOST = 400_000
-"""Grains of a body, about; where its dust would have more, the smallest ones are larger."""
+GRAIN = 1.5e-3
+"""Smallest chip [m], whatever the grid; what is finer is mist. Where that is more than a point,
+only some of the points have one."""
+SHARE, LARGEST = 1.0 / 40.0, 1.0 / 8.0
+"""Smallest chip, at most, and largest, as shares of the edge of a cube of the body's volume."""
+MIST = (0.1, 0.2)
+"""Share of dust that is mist: of powder, of juice."""
+FINE = 5e-4
+"""Mean size of the drops of mist [m] (Sauter): its volume over that is what it hides."""
+PUFF, GROWTH, WIDEST = 0.6, 0.12, 5.0
+"""Standard deviation of a puff when it leaves [edges], by how much of its way it grows, and how
+large it gets at most [edges]: then it is thinner than the eye can tell."""
+PALE = 0.35
+"""How far mist is paler than what it is of: it scatters light many times."""
+MOST = 60_000
+"""Chips of a body, about; where its dust would have more, the smallest ones are larger."""
 SCATTER = 0.2
 """How far grains scatter about their point, as a share of the way that it has gone from its chunk:
 so large are the differences of their speeds over its relative speed."""
@@ -50,18 +56,21 @@ LAG = 0.4
 """How far the smallest grains stay behind, as such a share: air holds them most."""
 BEGINS, FULL = 0.5, 1.5
 """Way from its chunk [edges of a point] at which a point begins to be drawn as dust, and is all."""
-SIGMA = 0.5
-"""Standard deviation of the splat of a grain, in its radii."""
 OPACITY = 0.97
-WET = (1.8, 1.0, 1.0)
-POWDER = (1.0, 0.8, 0.45)
-"""Proportions of drops, which are drawn out along their way, and of grains of powder, at most."""
-SPREAD = 3.0
-"""How many times wider a drop is that has landed; milk and water spread 2 to 4 times on impact
-(Pasandideh-Fard et al. 1996)."""
-THIN, DEEP = 0.62, 0.75
-"""Opacity and colour of a drop that has landed, over those in flight: so thin a film of juice lets
-the floor through, and a wet floor is darker."""
+SIDES = 6
+"""Sides of a chip, a splat each."""
+SIGMA, THIN = 0.6, 0.08
+"""Standard deviations of the splat of a side, along it in halves of the side, and across it."""
+FLAT = ((0.55, 1.0), (0.3, 0.7))
+"""Second and third edge of a chip over its first, from and to."""
+TILT = 0.35
+"""By how much the normals of its sides are tilted, as the tangent along each axis, at most."""
+TUMBLE = 0.5
+"""Turn of a chip [rad] on a way as long as it is large, at most."""
+DEEP = 0.75
+"""Colour of a drop that has landed over that in flight: a wet floor is darker."""
+FILM = 0.15
+"""Standard deviation of mist that has landed, across the floor [edges]."""
 LANDED, FALLING = 1.2, 2.4
 """Height of a point above the floor [its edges] at which its grains lie on it, and from which they
 know nothing of it: the grid feels the floor from a cell and a half away."""
@@ -71,6 +80,7 @@ STILL = 1e-3
 """A point that has gone less than this since the last frame [edges] lies still."""
 _ASKED = 4096  # points of a body that are asked for its mean colour, about
 _ROOM = 1 << 10  # numbers of grains for each point
+_AT_ONCE = (_ROOM - 1) // SIDES  # chips of a point, at most
 
 
 class Dust:
@@ -114,9 +124,18 @@ class Dust:
         for number in torch.unique(body).tolist():
             mine = rows[body == number]
             wet = materials.wet(self._scene.bodies[number].material.name)
-            made = grains(mine, self.edge[mine], self._finest[number], wet)
-            shade = functools.partial(self._juice, number, color) if wet else color
-            self._grains.append(made.at(self._matter.rest[made.row], shade))
+            least, most = self._sizes[number]
+            chips, mist = grains(mine, self.edge[mine], least, most, wet)
+            self._grains.append(chips.at(self._matter.rest[chips.row], color))
+            shade = functools.partial(self._pale, number, wet, color)
+            self._grains.append(mist.at(self._matter.rest[mist.row], shade))
+
+    def _pale(
+        self, number: int, wet: bool, color: Callable[[Tensor], Tensor], places: Tensor
+    ) -> Tensor:
+        """Colours [G, 3] of mist of a body."""
+        own = self._juice(number, color, places) if wet else color(places)
+        return torch.lerp(own, torch.ones_like(own), PALE)
 
     def _juice(self, number: int, color: Callable[[Tensor], Tensor], places: Tensor) -> Tensor:
         """Colours [G, 3] of drops of a body that come from places at rest [m], [G, 3]."""
@@ -135,19 +154,19 @@ class Dust:
         return solid.color[solid.occupancy][below >= below.median()].mean(dim=0)
 
     @functools.cached_property
-    def _finest(self) -> list[float]:
-        """Smallest grain of every body, in edges of a point."""
+    def _sizes(self) -> list[tuple[float, float]]:
+        """Smallest and largest chip of every body, in edges of a point."""
         bodies = self._scene.bodies
         body = self._matter.particles.body.long()
         points = torch.bincount(body, minlength=len(bodies)).cpu()
         share = torch.tensor([b.material.dust for b in bodies], dtype=torch.float64)
         expected = dust_limit(share, points) * points
-        found: list[float] = []
-        for its, many, own in zip(bodies, expected.tolist(), points.tolist(), strict=True):
-            wet = materials.wet(its.material.name)
-            wanted = (DROP if wet else GRAIN) / self._matter.spacing[len(found)]
-            found.append(max(finest(many, wet), min(wanted, SHARE * own ** (1.0 / 3.0))))
-        return found
+        return [
+            sizes(GRAIN / spacing, own, many)
+            for spacing, own, many in zip(
+                self._matter.spacing, points.tolist(), expected.tolist(), strict=True
+            )
+        ]
 
     def step(self, position: Tensor, led: Tensor) -> None:
         """Go on to the next frame.
@@ -192,31 +211,33 @@ class Dust:
 
 
 class Grains:
-    """Grains of some points of one body.
+    """Splats of the grains of some points of one body: sides of chips, or puffs of mist.
 
     Args:
         row: Point of each, int64 [G].
-        number: Which of its point's grains, int64 [G].
-        offset: Place in the cell of the point [m], [G, 3].
-        toward: Where it scatters to, of a length up to 1, [G, 3].
+        number: Which of its point's, int64 [G].
+        amount: Volume that it stands for [m^3], float64 [G].
+        offset: Place of its grain in the cell of the point [m], [G, 3].
+        toward: Where that scatters to, of a length up to 1, [G, 3].
         lag: How far it stays behind, 0 to 1, [G].
-        wet: Whether it is a drop, bool [G].
+        wet: Whether it darkens what it lands on, bool [G].
+        arm: Place of a side from the middle of its chip [m], [G, 3].
+        frame: Orientation of the chip, [G, 4].
+        half: Halves of its edges [m], [G, 3]; 0 for mist.
+        spin: Axis that it turns about times the turn on its way [rad/m], [G, 3].
         quats: Orientations, [G, 4].
         scales: Standard deviations [m], [G, 3].
         color: RGB in 0..1, [G, 3].
     """
 
     def __init__(
-        self, row: Tensor, number: Tensor, offset: Tensor, toward: Tensor, lag: Tensor,
-        wet: Tensor, quats: Tensor, scales: Tensor, color: Tensor | None = None,
+        self, row: Tensor, number: Tensor, amount: Tensor, offset: Tensor, toward: Tensor,
+        lag: Tensor, wet: Tensor, arm: Tensor, frame: Tensor, half: Tensor, spin: Tensor,
+        quats: Tensor, scales: Tensor, color: Tensor | None = None,
     ) -> None:  # fmt: skip
-        self.row, self.number, self.offset, self.toward = row, number, offset, toward
-        self.lag, self.wet, self.quats, self.scales, self.color = lag, wet, quats, scales, color
-
-    @property
-    def volume(self) -> Tensor:
-        """Volume of each [m^3], float64 [G]: of the ellipsoid of :data:`SIGMA`."""
-        return 4.0 / 3.0 * math.pi * (self.scales.double() / SIGMA).prod(dim=1)
+        self.row, self.number, self.amount, self.offset = row, number, amount, offset
+        self.toward, self.lag, self.wet, self.arm, self.frame = toward, lag, wet, arm, frame
+        self.half, self.spin, self.quats, self.scales, self.color = half, spin, quats, scales, color
 
     @staticmethod
     def joined(parts: list[Grains]) -> Grains:
@@ -226,8 +247,11 @@ class Grains:
         )
 
     def at(self, rest: Tensor, color: Callable[[Tensor], Tensor]) -> Grains:
-        """With the colours of their places; ``rest``: of their points [m], [G, 3]."""
-        self.color = color(rest + self.offset.to(rest))
+        """With the colours of their places; ``rest``: of their points [m], [G, 3].
+
+        A side has that of where it was: what lay at the skin wears it on one side.
+        """
+        self.color = color(rest + (self.offset + self.arm).to(rest))
         return self
 
     def drawn(
@@ -240,30 +264,42 @@ class Grains:
     ) -> Births:
         """Those of points that have left, as splats."""
         assert self.color is not None  # at
-        opacity = OPACITY * share(self.row)
-        some = (opacity > 0.0).nonzero()[:, 0]
-        row = self.row[some]
-        here, gone = position[row].float(), way[row]
-        reach = SCATTER * gone.norm(dim=1)
+        left = share(self.row)
+        some = (left > 0.0).nonzero()[:, 0]
+        row, left = self.row[some], left[some]
+        here, gone, size = position[row].float(), way[row], edge[row]
+        far = gone.norm(dim=1)
+        reach = SCATTER * far
         off = self.offset[some] + reach[:, None] * self.toward[some]
         off = off - LAG * self.lag[some, None] * gone
-        quats, scales, color = self.quats[some], self.scales[some], self.color[some]
-        opacity = opacity[some]
+        turn = _turned(self.spin[some] * far[:, None])
+        frame, quats = (
+            geometry.quaternion_multiply(turn, q[some]) for q in (self.frame, self.quats)
+        )
+        color, scales, half = self.color[some], self.scales[some], self.half[some]
+        puff = half[:, 0] == 0.0
+        wide = torch.minimum(scales[:, 0] + GROWTH * far, WIDEST * size)
+        scales = torch.where(puff[:, None], wide[:, None] * scales.new_tensor(_PUFF), scales)
+        # as many drops as are beside each other in the middle of the puff hide what is behind it
+        hidden = 1.5 * self.amount[some] / FINE / (2.0 * math.pi * wide.double().square())
+        opacity = torch.where(puff, (1.0 - torch.exp(-hidden)).clamp(max=OPACITY), OPACITY)
+        opacity = opacity.float() * left
         if floor is not None:
             # what lies on the floor is no heap
             height = (here[:, 2] - floor).clamp(min=0.0)
             most = off[:, 2].abs().clamp(min=1e-9)
             off[:, 2] *= torch.minimum(height / torch.maximum(most, reach), torch.ones_like(most))
-            lies = (FALLING - height / edge[row].clamp(min=1e-12)) / (FALLING - LANDED)
+            lies = (FALLING - height / size.clamp(min=1e-12)) / (FALLING - LANDED)
             lies = lies.clamp(0.0, 1.0)
-            wet = (self.wet[some] & (lies > 0.0)).nonzero()[:, 0]
-            quats[wet], scales[wet] = _spread(quats[wet], scales[wet], lies[wet])
-            opacity[wet] *= 1.0 - (1.0 - THIN) * lies[wet]
-            color[wet] *= 1.0 - (1.0 - DEEP) * lies[wet, None]
-            down = floor + _half_height(quats, scales) - (here + off)[:, 2]
+            film = torch.lerp(scales[:, 2], torch.minimum(FILM * size, scales[:, 2]), lies)
+            scales[:, 2] = torch.where(puff, film, scales[:, 2])
+            color = color * (1.0 - (1.0 - DEEP) * lies * self.wet[some])[:, None]
+            up = (geometry.quaternion_to_matrix(frame)[:, 2].abs() * half).sum(dim=1)
+            down = floor + torch.where(puff, 2.0 * scales[:, 2], up) - (here + off)[:, 2]
             off[:, 2] += lies * down
+        arm = geometry.quaternion_to_matrix(turn) @ self.arm[some][..., None]
         gaussians = Gaussians(
-            means=here + off,
+            means=here + off + arm[..., 0],
             quats=quats,
             scales=scales,
             opacities=opacity,
@@ -274,111 +310,136 @@ class Grains:
         return Births(gaussians, DUST + row * _ROOM + self.number[some], row)
 
 
-def _spread(quats: Tensor, scales: Tensor, lies: Tensor) -> tuple[Tensor, Tensor]:
-    """Drops that have landed by a share ``lies`` [G], 0 to 1: flatter and wider, as much of each.
-
-    Args:
-        quats: Orientations in flight, [G, 4].
-        scales: Standard deviations in flight [m], [G, 3].
-        lies: The share.
-    """
-    mean = scales.prod(dim=1, keepdim=True).pow(1.0 / 3.0)
-    long = (scales[:, :1] / mean).pow(0.5)  # what was drawn out lies as an oval
-    flat = mean * torch.cat(
-        [SPREAD * long, SPREAD / long, long.new_full(long.shape, SPREAD**-2)], 1
-    )
-    first = geometry.quaternion_to_matrix(quats)[..., 0]
-    turn = 0.5 * torch.atan2(first[:, 1], first[:, 0])
-    none = torch.zeros_like(turn)
-    level = torch.stack([turn.cos(), none, none, turn.sin()], dim=1)
-    level = level * torch.where((level * quats).sum(dim=1) < 0.0, -1.0, 1.0)[:, None]
-    turned = torch.nn.functional.normalize(torch.lerp(quats, level, lies[:, None]), dim=1)
-    return turned, torch.exp(torch.lerp(scales.log(), flat.log(), lies[:, None]))
+_PUFF = (1.0, 1.0, 0.95)  # a little flat, so that its light is that of a level thing
 
 
-def _half_height(quats: Tensor, scales: Tensor) -> Tensor:
-    """Half of the vertical extent of grains [m], [G]."""
-    return (geometry.quaternion_to_matrix(quats)[:, 2] * scales / SIGMA).norm(dim=1)
+def _turned(vector: Tensor) -> Tensor:
+    """Quaternions [G, 4] of rotation vectors [rad], [G, 3]."""
+    angle = vector.norm(dim=1, keepdim=True)
+    axis = vector / angle.clamp(min=1e-12)
+    return torch.cat([(0.5 * angle).cos(), (0.5 * angle).sin() * axis], dim=1)
 
 
-def grains(rows: Tensor, edge: Tensor, least: float, wet: bool) -> Grains:
-    """Grains of points: sizes by the law, volumes that sum to each point's.
-
-    Where a grain is larger than a point, as many points have one as makes the volumes right on
-    average.
+def grains(
+    rows: Tensor, edge: Tensor, least: float, most: float, wet: bool
+) -> tuple[Grains, Grains]:
+    """Chips and mist of points: sizes by the law, volumes that are right on average.
 
     Args:
         rows: The points, int64 [K].
         edge: Edges of the cubes of their volumes [m], [K].
-        least: Smallest grain, in edges.
-        wet: Drops, or else powder.
+        least: Smallest chip, in edges.
+        most: Largest chip, in edges.
+        wet: Juice, or else powder.
+
+    Returns:
+        The sides of the chips, and a puff of mist for every point.
     """
-    many = per_point(least, wet)
-    if many < 1.0:
-        has = 0.5 + 0.5 * hashed((rows * 0x9E3779B1) & 0xFFFFFFFF, 13) < many
-        rows, edge = rows[has], edge[has]
-    count = max(1, round(many))
-    number = torch.arange(count, device=rows.device)
-    seed = ((rows[:, None] * 0x9E3779B1) & 0xFFFFFFFF) ^ ((number * 0x85EBCA6B) & 0xFFFFFFFF)
+    share = MIST[wet]
+    many = (1.0 - share) * per_point(least, most)
+    own = (rows * 0x9E3779B1) & 0xFFFFFFFF
+    count = (many + 0.5 + 0.5 * hashed(own, 13)).floor().long()
+    row, size = rows.repeat_interleave(count), edge.double().repeat_interleave(count)
+    first = count.cumsum(0) - count
+    number = torch.arange(len(row), device=rows.device) - first.repeat_interleave(count)
+    seed = own.repeat_interleave(count) ^ ((number * 0x85EBCA6B) & 0xFFFFFFFF)
     # one size in each of as many strata, so that every point has some of all
-    drawn = 0.5 + 0.5 * hashed(seed, 0)
-    size = quantile((number + drawn) / count, least, wet)
-    if many >= 1.0:
-        size = size * (size.pow(3).sum(dim=1, keepdim=True) * (math.pi / 6.0)).pow(-1.0 / 3.0)
-    size = size.reshape(-1)
-    seed, row = seed.reshape(-1), rows.repeat_interleave(count)
+    drawn = (number + 0.5 + 0.5 * hashed(seed, 0)) / count.repeat_interleave(count)
+    size = size * quantile(drawn, least, most)
+    chips = _chips(row, number, seed, size, edge.double().repeat_interleave(count))
+    toward, offset = _thrown(own, edge.double())
+    none, still = torch.zeros_like(offset), offset.new_tensor([1.0, 0.0, 0.0, 0.0])
+    still = still.expand(len(rows), 4)
+    mist = [
+        share * edge.double().pow(3), offset, 0.5 * toward, torch.ones_like(edge).double(),
+        torch.full_like(rows, wet, dtype=torch.bool), none, still, none, none, still,
+        (PUFF * edge.double())[:, None] * offset.new_tensor(_PUFF),
+    ]  # fmt: skip
+    last = torch.full_like(rows, _ROOM - 1)
+    return Grains(*chips), Grains(rows, last, mist[0], *(_single(value) for value in mist[1:]))
+
+
+def _single(value: Tensor) -> Tensor:
+    return value.float() if value.is_floating_point() else value
+
+
+def _thrown(seed: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
+    """Where grains scatter to, and where they were in the cell of their point [m], [G, 3] each."""
     height, angle = hashed(seed, 1), math.pi * hashed(seed, 2)
     ring = (1.0 - height * height).sqrt()
     toward = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1)
     out = (0.5 + 0.5 * hashed(seed, 3))[:, None] * toward
-    lag = (0.5 + 0.5 * hashed(seed, 12)) * (1.0 - (size / _largest(least, wet)).clamp(max=1.0))
-    offset = 0.5 * hashes(seed, range(4, 7)) * edge.double().repeat_interleave(count)[:, None]
-    draw = (0.5 + 0.5 * hashed(seed, 7))[:, None]
-    shape = 1.0 + draw * (draw.new_tensor(WET if wet else POWDER) - 1.0)
-    shape = shape / shape.prod(dim=1, keepdim=True).pow(1.0 / 3.0)
-    if wet:
-        quats = _along(toward)
-    else:
-        quats = torch.nn.functional.normalize(hashes(seed, range(8, 12)) + 1e-6, dim=1)
-    size = size * edge.double().repeat_interleave(count)
-    scales = (SIGMA * 0.5) * size[:, None] * shape
-    offset, out, lag, quats, scales = (
-        value.to(torch.float32) for value in (offset, out, lag, quats, scales)
+    return out, 0.5 * hashes(seed, range(4, 7)) * edge[:, None]
+
+
+def _chips(row: Tensor, number: Tensor, seed: Tensor, size: Tensor, edge: Tensor) -> list[Tensor]:
+    """The sides of chips of some sizes [m], float64 [C], as :class:`Grains` takes them."""
+    toward, offset = _thrown(seed, edge)
+    draw = 0.5 + 0.5 * hashes(seed, range(7, 9))
+    low, high = draw.new_tensor(FLAT).unbind(dim=1)
+    half = torch.cat([torch.ones_like(draw[:, :1]), low + draw * (high - low)], dim=1)
+    half = half * (math.pi / 6.0 / half.prod(dim=1, keepdim=True)).pow(1.0 / 3.0)
+    half = 0.5 * half * size[:, None]
+    frame = torch.nn.functional.normalize(hashes(seed, range(9, 13)) + 1e-6, dim=1)
+    lag = (0.5 + 0.5 * hashed(seed, 14)) * (1.0 - (size / (2.0 * edge)).clamp(max=1.0))
+    spin = TUMBLE * hashes(seed, range(15, 18)) / size[:, None]
+    # each side lies across an axis, at one end of it
+    axis = torch.arange(SIDES, device=row.device) // 2
+    end = 1.0 - 2.0 * (torch.arange(SIDES, device=row.device) % 2)
+    across, along = (
+        torch.eye(3, dtype=half.dtype, device=row.device)[(axis + k) % 3] for k in range(2)
     )
-    number = number.repeat(len(rows))
-    drops = torch.full_like(row, wet, dtype=torch.bool)
-    return Grains(row, number, offset, out, lag, drops, quats, scales)
+    place = end[:, None] * across * half[:, None]
+    tilt = TILT * hashes(seed, range(20, 20 + 3 * SIDES)).view(-1, SIDES, 3)
+    normal = torch.nn.functional.normalize(end[:, None] * across + tilt, dim=2)
+    first = along - normal * (normal * along).sum(dim=2, keepdim=True)
+    first = torch.nn.functional.normalize(first, dim=2)
+    second = torch.linalg.cross(normal, first)
+    local = geometry.matrix_to_quaternion(
+        torch.stack([first, second, normal], dim=3).view(-1, 3, 3)
+    )
+    wide = half[:, (axis + 1) % 3], half[:, (axis + 2) % 3]
+    thin = THIN * half.amin(dim=1, keepdim=True).expand(-1, SIDES)
+    scales = torch.stack([SIGMA * wide[0], SIGMA * wide[1], thin], dim=2)
+
+    def each(value: Tensor) -> Tensor:
+        return value.repeat_interleave(SIDES, dim=0)
+
+    arm = geometry.quaternion_to_matrix(frame)[:, None] @ place[..., None]
+    numbers = each(SIDES * number) + torch.arange(SIDES, device=row.device).repeat(len(row))
+    made = [
+        each(offset), each(toward), each(lag), torch.zeros_like(numbers, dtype=torch.bool),
+        arm.reshape(-1, 3), each(frame), each(half), each(spin),
+        geometry.quaternion_multiply(each(frame), local), scales.view(-1, 3),
+    ]  # fmt: skip
+    amount = each(math.pi / 6.0 / SIDES * size.pow(3))
+    return [each(row), numbers, amount, *(_single(value) for value in made)]
 
 
-def _along(toward: Tensor) -> Tensor:
-    """Quaternions [G, 4] that turn the first axis to unit vectors [G, 3]."""
-    x, y, z = toward.unbind(dim=1)
-    half = torch.stack([1.0 + x, torch.zeros_like(x), -z, y], dim=1)
-    flat = half.new_tensor([0.0, 0.0, 0.0, 1.0])
-    half = torch.where((x < -1.0 + 1e-9)[:, None], flat, half)
-    return torch.nn.functional.normalize(half, dim=1)
-
-
-def quantile(share: Tensor, least: float, wet: bool) -> Tensor:
-    """Size below which a share of the grains lies, in edges, by ``n(d) ~ d^-3.5``."""
-    low, high = least ** (1.0 - BETA), _largest(least, wet) ** (1.0 - BETA)
+def quantile(share: Tensor, least: float, most: float) -> Tensor:
+    """Size below which a share of the chips lies, by ``n(d) ~ d^-3.5``."""
+    low, high = least ** (1.0 - BETA), most ** (1.0 - BETA)
     return (low + share * (high - low)).pow(1.0 / (1.0 - BETA))
 
 
-def _largest(least: float, wet: bool) -> float:
-    """Largest grain: few grains that have a point's volume are larger."""
-    return max(SPLASH if wet else COARSEST, 1.6 * least)
+def per_point(least: float, most: float) -> float:
+    """Chips of the law that have the volume of a point: as balls, on average."""
+    cubes = (most ** (4.0 - BETA) - least ** (4.0 - BETA)) / (4.0 - BETA)
+    many = (least ** (1.0 - BETA) - most ** (1.0 - BETA)) / (BETA - 1.0)
+    return 6.0 / math.pi * many / cubes
 
 
-def per_point(least: float, wet: bool) -> float:
-    """Grains of the law that have the volume of a point: as balls, on average."""
-    low, high = least, _largest(least, wet)
-    cubes = (high ** (4.0 - BETA) - low ** (4.0 - BETA)) / (4.0 - BETA)
-    many = (low ** (1.0 - BETA) - high ** (1.0 - BETA)) / (BETA - 1.0)
-    return min(float(_ROOM), 6.0 / math.pi * many / cubes)
+def sizes(smallest: float, points: int, dust: float) -> tuple[float, float]:
+    """Smallest and largest chip of a body [edges].
 
-
-def finest(points: float, wet: bool) -> float:
-    """Smallest grain [edges] with which so many points of dust stay within :data:`MOST`."""
-    steps = [FINEST * 4.0 ** (k / 32.0) for k in range(33)]
-    return next((size for size in steps if points * per_point(size, wet) <= MOST), steps[-1])
+    Args:
+        smallest: :data:`GRAIN`, in edges.
+        points: Points of the body.
+        dust: How many of them may be dust.
+    """
+    whole = max(1, points) ** (1.0 / 3.0)
+    most, least = max(1.0, LARGEST * whole), min(smallest, SHARE * whole)
+    fits = min(float(_AT_ONCE - 1), MOST / max(dust, 1.0))
+    while least < 0.5 * most and per_point(least, most) > fits:
+        least *= 1.1
+    return min(least, 0.5 * most), most

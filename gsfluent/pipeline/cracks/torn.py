@@ -70,8 +70,8 @@ class Shares(NamedTuple):
     def _enough(self) -> Tensor:
         return (self.many >= PART) | (self.piece == self.dust)
 
-    def parting(self, regions: int, bodies: int) -> tuple[list[int], list[int]]:
-        """Regions that must be divided, and chips that have become dust.
+    def parting(self, regions: int, bodies: int) -> list[int]:
+        """Regions that must be divided.
 
         Args:
             regions: Number of regions.
@@ -85,8 +85,7 @@ class Shares(NamedTuple):
         chip = size < CHIP
         chip[:bodies] = False
         torn = ((pieces > 1) | ((lost > 0) & (TRICKLE * lost >= size))) & ~chip
-        found = torch.stack([torn, chip & (2 * lost > size)]).cpu()
-        return found[0].nonzero()[:, 0].tolist(), found[1].nonzero()[:, 0].tolist()
+        return torn.nonzero()[:, 0].tolist()
 
     def torn(self, regions: list[int], rows: Tensor, rest: Tensor) -> list[Torn]:
         """What some regions fall into.

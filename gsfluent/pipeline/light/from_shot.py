@@ -26,8 +26,8 @@ from gsfluent.pipeline.light.lamps import (
 from gsfluent.pipeline.liquid.clear import Clear
 from gsfluent.results.frames import DUST, SavedFrame
 
-DROPS = (0.25, 16.0)
-"""k_s and n_s of drops of juice, whose splats have one normal each and no dome."""
+JUICE = (0.1, 16.0)
+"""k_s and n_s of chips and mist of what is wet: a film of juice on each side."""
 _SHARED = ("ambient", "specular", "shininess", "occlusion", "delight", "resolution")
 
 
@@ -125,8 +125,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
     """k_s and n_s of every splat, [N, 2], from the material of the body that it follows.
 
     None for frames that do not say which body is what (written by an older gsfluent). Splats of
-    rigid things are steel, and the dust of what is wet are drops: round, so that a highlight takes
-    a small part of each (:data:`DROPS`).
+    rigid things are steel, and the dust of what is wet has juice on it (:data:`JUICE`).
     """
     names = frame.facts.get("bodies")
     if not names:
@@ -139,7 +138,7 @@ def gloss_of(shot: Shot, frame: SavedFrame) -> Tensor | None:
             row = (made_of.specular, made_of.shininess)
         rows.append(row)
         wet.append(materials.wet(preset))
-    rows += [(materials.get("steel").specular, materials.get("steel").shininess), DROPS]
+    rows += [(materials.get("steel").specular, materials.get("steel").shininess), JUICE]
     table = torch.tensor(rows).to(frame.gaussians.means)
     anchor = frame.anchor.long()
     body = frame.body[anchor.clamp(min=0)].long()

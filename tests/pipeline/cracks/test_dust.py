@@ -8,17 +8,16 @@ import pytest
 import torch
 from test_chunks import apart, binding, drawn, halves, moment
 
-from gsfluent import geometry
 from gsfluent.pipeline.cracks.dust import (
     BETA,
-    COARSEST,
+    FINE,
     JUICE,
+    MIST,
     MOST,
-    SIGMA,
-    SPREAD,
-    finest,
+    SIDES,
     grains,
     per_point,
+    sizes,
 )
 from gsfluent.pipeline.cracks.stage import Repair
 from gsfluent.pipeline.matter.carry import Carry
@@ -31,38 +30,32 @@ def bound() -> Carry:
 
 
 @pytest.mark.parametrize("wet", [True, False])
-@pytest.mark.parametrize("least", [0.125, 0.25, 0.5])
-def test_volumes_sum_to_those_of_the_points(least: float, wet: bool) -> None:
-    rows = torch.tensor([3, 70_001, 12, 8])
-    edge = torch.tensor([1e-3, 2e-3, 5e-3, 1e-2])
-    made = grains(rows, edge, least, wet)
-    for row, own in zip(rows.tolist(), edge.double().tolist(), strict=True):
-        assert float(made.volume[made.row == row].sum()) == pytest.approx(own**3, rel=1e-6)
-    inside = (
-        made.offset.abs().amax(dim=1)
-        <= 0.5 * edge.repeat_interleave(round(per_point(least, wet))) * 1.001
-    )
-    assert bool(inside.all())
-    assert float(made.toward.norm(dim=1).max()) <= 1.0 + 1e-6
+@pytest.mark.parametrize(
+    ("least", "most", "count"), [(0.125, 1.0, 300), (0.7, 2.8, 20_000), (1.9, 7.0, 200_000)]
+)
+def test_volumes_are_those_of_the_points_on_average(
+    least: float, most: float, count: int, wet: bool
+) -> None:
+    """Chips larger than a point are had by some points only, whoever else there is."""
+    rows, edge = torch.arange(count), torch.full((count,), 2e-3)
+    chips, mist = grains(rows, edge, least, most, wet)
+    whole = len(rows) * 2e-3**3
+    assert float(mist.amount.sum()) == pytest.approx(MIST[wet] * whole)
+    assert float(chips.amount.sum()) == pytest.approx((1.0 - MIST[wet]) * whole, rel=0.05)
+    size = (6.0 / torch.pi * SIDES * chips.amount).pow(1.0 / 3.0) / 2e-3
+    assert float(size.min()) > 0.999 * least and float(size.max()) < 1.001 * most
+    some, _ = grains(rows[::7], edge[::7], least, most, wet)
+    assert torch.equal(some.row, chips.row[chips.row % 7 == 0])
+    assert len((chips.row * 1024 + chips.number).unique()) == len(chips.row)
+    assert int(chips.number.max()) < 1023
+    assert float(chips.offset.abs().max()) <= 1e-3 * 1.001
+    assert float(chips.toward.norm(dim=1).max()) <= 1.0 + 1e-6
 
 
-def test_grains_larger_than_a_point_have_its_volume_on_average() -> None:
-    rows, edge = torch.arange(60_000), torch.full((60_000,), 2e-3)
-    made = grains(rows, edge, 1.5, wet=True)
-    size = (6.0 / torch.pi * made.volume).pow(1.0 / 3.0)
-    assert float(size.min()) > 2.9e-3 and float(size.max()) < 5e-3
-    assert 0 < len(made.row) < 0.5 * len(rows) and len(made.row.unique()) == len(made.row)
-    assert float(made.volume.sum()) == pytest.approx(len(rows) * 2e-3**3, rel=0.02)
-    some = grains(rows[::7], edge[::7], 1.5, wet=True)
-    assert torch.equal(some.row, made.row[made.row % 7 == 0])  # a row has its own, or none
-
-
-@pytest.mark.parametrize("least", [0.125, 0.2])
-def test_grains_are_as_frequent_as_their_size_says(least: float) -> None:
-    made = grains(torch.arange(2000), torch.ones(2000), least, wet=False)
-    size = (6.0 / torch.pi * made.volume).pow(1.0 / 3.0)
-    low, high = least, COARSEST
-    assert float(size.min()) > 0.9 * low and float(size.max()) < 1.1 * high
+def test_chips_are_as_frequent_as_their_size_says() -> None:
+    low, high = 0.2, 2.0
+    chips, _ = grains(torch.arange(2000), torch.ones(2000), low, high, wet=False)
+    size = (6.0 / torch.pi * SIDES * chips.amount[::SIDES]).pow(1.0 / 3.0)
     # likeliest exponent of a law between two bounds, by Newton's method
     mean, b = float((size / low).log().mean()), 3.0
     span = float(torch.tensor(high / low).log())
@@ -74,53 +67,106 @@ def test_grains_are_as_frequent_as_their_size_says(least: float) -> None:
     assert b == pytest.approx(BETA, abs=0.1)
 
 
+def flown(bound: Carry, way: float, wet: bool = True):
+    """Chips and mist of 40 points that have gone a way, drawn."""
+    rows, edge = torch.arange(40), torch.full((40,), 2e-3)
+    here = torch.zeros(40, 3) + torch.tensor([0.0, 0.0, 1.0])
+    gone = torch.tensor([way, 0.0, 0.0]).expand(40, 3)
+    made = grains(rows, edge, 0.7, 2.8, wet)
+    return [
+        (g, g.at(here[g.row], lambda p: p).drawn(here, edge, gone, torch.ones_like, None).gaussians)
+        for g in made
+    ]
+
+
+def test_never_a_bead(bound: Carry) -> None:
+    """What is seen one by one has flat sides, looking six ways, and tumbles as one."""
+    (made, near), _ = flown(bound, 0.01)
+    (_, far), _ = flown(bound, 0.5)
+    assert float((near.scales.amax(dim=1) / near.scales.amin(dim=1)).min()) > 4.0
+    for seen in (near, far):
+        normal = seen.normals.view(-1, SIDES, 3)
+        assert float((normal @ normal.transpose(1, 2)).amin(dim=(1, 2)).max()) < -0.6
+        # a side looks away from the middle of its chip, and is as far from the others as at first
+        middle = seen.means.view(-1, SIDES, 3)
+        arm = middle - middle.mean(dim=1, keepdim=True)
+        assert float((arm * normal).sum(dim=2).min()) > 0.0
+        wanted = torch.cdist(made.arm.view(-1, SIDES, 3), made.arm.view(-1, SIDES, 3))
+        assert torch.allclose(torch.cdist(middle, middle), wanted, atol=2e-6)
+    turned = (near.normals * far.normals).sum(dim=1)
+    assert float(turned.min()) < 0.0
+
+
+def test_a_chip_from_the_skin_wears_it_on_one_side(bound: Carry) -> None:
+    rows = torch.arange(200)
+    chips, _ = grains(rows, torch.full((200,), 2e-3), 1.0, 2.8, wet=True)
+    red, white = torch.tensor([0.8, 0.1, 0.1]), torch.tensor([0.9, 0.9, 0.8])
+    skin = lambda p: torch.where((p[:, 2] > 0.0)[:, None], red, white)  # noqa: E731
+    color = chips.at(torch.zeros(len(chips.row), 3), skin).color.view(-1, SIDES, 3)
+    both = (color == red).all(dim=2).any(dim=1) & (color == white).all(dim=2).any(dim=1)
+    assert float(both.float().mean()) > 0.6
+
+
+def test_mist_hides_what_its_drops_hide(bound: Carry) -> None:
+    """And ever less as it spreads; near the end nothing of it is to be seen."""
+    amount = 2e-3**3 * MIST[1]
+    before = 1.0
+    for way in (0.02, 0.05):
+        _, (_, mist) = flown(bound, way)
+        wide = mist.scales[:, 0].double()
+        seen = -(1.0 - mist.opacities.double()).log() * 2.0 * torch.pi * wide.square()
+        assert torch.allclose(seen, torch.full_like(seen, 1.5 * amount / FINE), rtol=1e-3)
+        assert float(mist.opacities.max()) < 0.5 * before
+        before = float(mist.opacities.min())
+    assert before < 0.05
+
+
 def test_a_row_has_its_grains_whatever_is_around() -> None:
     rows = torch.tensor([5, 900, 31, 77, 4_000_000])
     mixed = torch.tensor([77, 4_000_000, 5, 31, 900])
-    one, two = (grains(r, torch.full((5,), 2e-3), 0.25, wet=True) for r in (rows, mixed))
-    for row in rows.tolist():
-        for name in ("offset", "toward", "lag", "quats", "scales", "number"):
-            pair = (getattr(g, name)[g.row == row] for g in (one, two))
-            assert torch.equal(*pair)
-    first, second = (one.offset[one.row == row] for row in (5, 31))
-    assert not torch.allclose(first, second)
+    edge = torch.full((5,), 2e-3)
+    made = (grains(r, edge, 0.25, 1.0, wet=True) for r in (rows, mixed))
+    for one, two in zip(*made, strict=True):
+        for row in rows.tolist():
+            for name in ("offset", "toward", "lag", "quats", "scales", "number", "arm", "spin"):
+                pair = (getattr(g, name)[g.row == row] for g in (one, two))
+                assert torch.equal(*pair)
+        first, second = (one.offset[one.row == row][:1] for row in (5, 31))
+        assert not torch.allclose(first, second)
 
 
 @pytest.mark.parametrize("wet", [True, False])
-def test_drops_spread_on_the_floor_and_grains_lie_on_it(wet: bool) -> None:
-    """Volumes stay; what is high has the bits that it had in flight; nothing is below the floor."""
+def test_chips_lie_on_the_floor_and_mist_wets_it(wet: bool) -> None:
+    """What is high has what it had in flight; nothing is below the floor."""
     rows, floor = torch.arange(3), 0.25
     edge = torch.full((3,), 6e-3)
     place = torch.tensor([[0.0, 0.0, 0.004], [0.1, 0.0, 0.011], [0.2, 0.0, 0.2]])
     place[:, 2] += floor
     way = torch.tensor([0.03, 0.0, -0.02]).expand(3, 3)
-    made = grains(rows, edge, 0.25, wet)
-    made = made.at(place[made.row], torch.zeros_like)
-    drawn = made.drawn(place, edge, way, lambda row: torch.ones_like(edge)[row], floor).gaussians
-    volume = drawn.scales.double().prod(dim=1)
-    assert torch.allclose(volume, made.scales.double().prod(dim=1), rtol=1e-5)
-    lying, between, high = (made.row == k for k in range(3))
-    assert torch.equal(drawn.scales[high], made.scales[high])
-    assert torch.equal(drawn.quats[high], made.quats[high])
-    half = geometry.quaternion_to_matrix(drawn.quats)[:, 2] * drawn.scales / SIGMA
-    bottom = drawn.means[:, 2] - half.norm(dim=1) - floor
-    assert float(bottom[lying].abs().max()) < 1e-6
-    assert float(bottom[between | high].min()) > -1e-3
-    ratio = drawn.scales[lying].amax(dim=1) / drawn.scales[lying].amin(dim=1)
-    assert float(ratio.min()) >= SPREAD**3 - 1e-3 if wet else float(ratio.max()) < 3.0
-    if wet:
-        assert float(drawn.normals[lying][:, 2].abs().min()) > 1.0 - 1e-5
+    seen = []
+    for made in grains(rows, edge, 0.25, 1.0, wet):
+        made = made.at(place[made.row], lambda p: torch.full_like(p, 0.5))
+        drawn = made.drawn(place, edge, way, lambda r: torch.ones(len(r)), floor).gaussians
+        free = made.drawn(place, edge, way, lambda r: torch.ones(len(r)), None).gaussians
+        seen.append((made, drawn))
+        lying, high = made.row == 0, made.row == 2
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert torch.equal(getattr(drawn, name)[high], getattr(free, name)[high])
+        assert float(drawn.means[:, 2].min()) > floor - 1e-4
+    (chips, drawn), (mist, puffs) = seen
+    assert float((drawn.means[chips.row == 0, 2] - floor).max()) < 1.0 * 6e-3
+    lying = mist.row == 0
+    assert float((puffs.scales[lying, 2] / puffs.scales[lying, 0]).max()) < 0.3
+    darker = float(puffs.sh[lying].mean()) < float(puffs.sh[mist.row == 2].mean()) - 0.1
+    assert darker == wet
 
 
-def test_much_dust_has_larger_grains() -> None:
-    assert finest(10.0, False) == 0.125
-    sizes = [finest(float(n), False) for n in (10, 3000, 9000, 30_000, 1e6)]
-    assert sizes == sorted(sizes) and sizes[-1] == 0.5
-    assert all(
-        n * per_point(finest(n, wet), wet) <= MOST
-        for n in (10.0, 1000.0, 10_000.0)
-        for wet in (True, False)
-    )
+def test_much_dust_has_larger_chips() -> None:
+    assert sizes(0.7, 24_000, 100.0) == (0.7, pytest.approx(24_000 ** (1 / 3) / 8))
+    found = [sizes(0.1, 24_000, n)[0] for n in (10.0, 3000.0, 9000.0, 30_000.0, 1e6)]
+    assert found == sorted(found) and found[0] < found[-1]
+    for n in (10.0, 1000.0, 10_000.0):
+        assert n * per_point(*sizes(0.1, 24_000, n)) <= MOST
 
 
 def thrown(bound: Carry, far: float):
@@ -175,10 +221,7 @@ def test_dust_does_not_pop(bound: Carry) -> None:
     assert 0.0 < opacity[0] < opacity[1] < opacity[2] == opacity[3] == opacity[4]
 
 
-def test_drops_are_of_many_sizes_in_the_colour_of_the_flesh(bound: Carry) -> None:
-    made = grains(torch.arange(500), torch.full((500,), 6e-3), 0.25, wet=True)
-    size = (6.0 / torch.pi * made.volume).pow(1.0 / 3.0)
-    assert float(size.max() / size.min()) > 3.5
+def test_mist_of_juice_has_the_colour_of_the_flesh(bound: Carry) -> None:
     dust = Repair().begin(bound)._gaps._dust
     solid = bound.scene.bodies[0].solid
     inside = solid.depth > solid.depth[solid.occupancy].median()
@@ -232,29 +275,22 @@ def chips(bound: Carry, dusty: int):
     return moment(bound, unit, apart(bound, 0.1))
 
 
-def test_a_chip_is_not_divided_and_melts_when_most_of_it_is_dust(bound: Carry) -> None:
-    history, other = Repair().begin(bound), Repair().begin(bound)
-    for h in (history, other):
-        h.step(chips(bound, 0))
+def test_a_chip_is_not_divided_when_its_points_have_become_dust(bound: Carry) -> None:
+    """It stays what it was cut as, with its skin: apart they would be a spray of grains."""
+    history, again = Repair().begin(bound), Repair().begin(bound)
+    history.step(chips(bound, 0))
     whole = history._gaps
-    partition = whole._partitions[0]
-    assert len(whole._events) == len(partition.splits) == 1 and whole._regions == 4
-    assert history.step(chips(bound, 8)).dust is None
-    assert len(whole._events) == 1
-    many = len(other.step(chips(bound, 12)).births.ids)  # the same without the step between
-    cracks = history.step(chips(bound, 12))
-    assert len(cracks.births.ids) == many
-    # nothing was cut anew, all points of both are dust, and a run that is taken up has the same
-    assert len(whole._events) == 3 and len(partition.splits) == 1
-    assert int(whole._gone.sum()) == 40 and torch.equal(whole._ash, other._gaps._ash)
-    assert set(whole._chunk.unique().tolist()) == {0, 1}
-    again = Repair().begin(bound)
+    assert len(whole._events) == len(whole._partitions[0].splits) == 1 and whole._regions == 4
+    for dusty in (8, 12, 20):
+        cracks = history.step(chips(bound, dusty))
+        assert cracks.dust is None and int((cracks.births.ids >= DUST).sum()) == 0
+        assert len(whole._events) == 1 and int(whole._gone.sum()) == 0
+    assert set(whole._chunk.unique().tolist()) == {0, 1, 2, 3}
     again.restore(history.state())
-    want, got = (h.step(chips(bound, 12)) for h in (history, again))
+    got = again.step(chips(bound, 20))
     for name in ("ids", "anchor"):
-        assert torch.equal(*(getattr(c.births, name) for c in (want, got)))
+        assert torch.equal(*(getattr(c.births, name) for c in (cracks, got)))
     assert torch.equal(again._gaps._chunk, whole._chunk)
-    assert torch.equal(again._gaps._ash, whole._ash)
 
 
 def test_no_dust_no_grains(bound: Carry) -> None:

@@ -23,7 +23,7 @@ from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
 from gsfluent.pipeline.light.from_shot import (
-    DROPS,
+    JUICE,
     changed,
     clear_of,
     gloss_of,
@@ -429,7 +429,7 @@ def test_materials_say_how_shiny_splats_are(tmp_path: Path, skin: Gaussians) -> 
     loose.anchor[3] = -1  # a blade
     assert float(gloss_of(shot(tmp_path), loose)[3, 0]) > 0.5  # type: ignore[index]
     loose.ids[5], loose.dust = DUST + 7, torch.tensor([5])  # a drop of its juice
-    drop = torch.tensor(DROPS)
+    drop = torch.tensor(JUICE)
     torch.testing.assert_close(gloss_of(shot(tmp_path), loose)[5], drop)  # type: ignore[index]
     assert plates_of(loose).nonzero()[:, 0].tolist() == [3, 5]
     loose.facts = {}
