@@ -16,7 +16,7 @@ from torch import Tensor
 from gsfluent.data import Gaussians, Solid
 from gsfluent.pipeline.matter.carry import nearest_points
 from gsfluent.pipeline.matter.points import Matter, body_frame
-from gsfluent.pipeline.solid.colors import surface_colors
+from gsfluent.pipeline.solid.colors import surface_colors_at
 from gsfluent.scene.scene import Scene
 from gsfluent.spatial.neighbours import nearest_rows
 from gsfluent.spatial.pieces import sample, signed_depth
@@ -132,8 +132,8 @@ def skin_colors_at(solid: Solid, means: Tensor) -> Tensor | None:
     """Colours of the skin near places [M, 3] in the solid's coordinates; None where it has none."""
     if means.shape[0] == 0 or not _has_skin(solid.gaussians):
         return None
-    shown = surface_colors(solid.gaussians, means.double().cpu().numpy(), 0.5 * solid.voxel)
-    return torch.from_numpy(shown)
+    shown = surface_colors_at(solid.gaussians, means.double(), 0.5 * solid.voxel)
+    return shown.to(torch.float32)
 
 
 def _has_skin(gaussians: Gaussians) -> bool:

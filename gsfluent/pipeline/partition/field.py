@@ -65,13 +65,15 @@ def boxes(labels: Tensor, count: int) -> list[Box | None]:
     ends = []
     for axis in range(3):
         size = labels.shape[axis]
-        line = torch.bincount(label * size + where[:, axis], minlength=count * size)
-        there = line.view(count, size) > 0
+        there = torch.zeros(count * size, dtype=torch.bool, device=labels.device)
+        there = there.index_fill_(0, label * size + where[:, axis], True).view(count, size)
         steps = torch.arange(size, device=labels.device)
-        low = torch.where(there, steps, size).amin(dim=1)
-        high = torch.where(there, steps, -1).amax(dim=1)
-        ends.append(torch.stack([low, high], dim=1).tolist())
-    found = [[(a, b) for a, b in (axis[n] for axis in ends)] for n in range(count)]
+        ends += [
+            torch.where(there, steps, size).amin(dim=1),
+            torch.where(there, steps, -1).amax(dim=1),
+        ]
+    # one look for all: each waits for a GPU
+    found = [[(a, i), (b, j), (c, k)] for a, i, b, j, c, k in torch.stack(ends, dim=1).tolist()]
     return [box if box[0][1] >= 0 else None for box in found]
 
 

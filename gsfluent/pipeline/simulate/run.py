@@ -35,6 +35,10 @@ MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
 REGROUP = 64
 """Grid steps between two looks for new pieces within a frame."""
+RARELY, MANY = 192, 2000
+"""Such a look is due when a 2000th of the points has broken since the last one, or after 192 steps
+when any has: on a GPU a look takes as long as a hundred steps, and what few points hold together
+can wait."""
 MOVED = 0.25
 """Cells that something must have moved for such a look: pieces that have not parted need none, and
 stiff things take thousands of steps for that."""
@@ -139,7 +143,7 @@ class Run:
             state = self._regroup(state)
         state = bounded(state)
         watch.keep(state, only=True)
-        checked = grouped = state.step
+        checked = grouped = regrouped = state.step
         broken, looked = self._broken(state), state.time
         while state.time < until:
             trouble: Unhealthy | None = None
@@ -166,12 +170,15 @@ class Run:
                     self.seconds += clock.perf_counter() - begun
                     return False
                 state = back
-                checked = grouped = state.step
+                checked = grouped = regrouped = state.step
                 looked = min(looked, state.time)
             elif state.step - grouped >= REGROUP and checked == state.step:
                 grouped = state.step
-                if broken != self._broken(state) and self._moved(state, looked):
+                change = abs(self._broken(state) - broken)
+                due = change * MANY >= len(state.peak) or state.step - regrouped >= RARELY
+                if change and due and self._moved(state, looked):
                     state, looked = self._regroup(state, at_frame=False), state.time
+                    regrouped = state.step
                     broken = self._broken(state)  # some may have been welded
         self.state = state
         waits = [body.held and body.start > state.time for body in self.scene.bodies]

@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    colors="keep_skin skin_colors skin_weights surface_colors",
+    colors="keep_skin skin_colors skin_weights surface_colors surface_colors_at",
     evidence="Evidence SolidOptions",
     field="SignedDistance",
     hollow="cavity_volume",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsfluent.data import INTERIOR, SURFACE, Gaussians, Solid
 from gsfluent.draw import draw
@@ -11,7 +12,7 @@ from gsfluent.errors import InputError
 from gsfluent.geometry import rgb_to_sh0
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.tsdf import ring_of_cameras
-from gsfluent.spatial.neighbours import nearest
+from gsfluent.spatial.neighbours import nearest_rows
 
 _NEIGHBOURS = 12
 _FAINT = 0.1  # opacity below which a splat is fuzz
@@ -51,55 +52,73 @@ def surface_colors(
     Raises:
         InputError: There are no surface splats.
     """
+    where = torch.from_numpy(np.asarray(points, dtype=np.float64)).to(gaussians.device)
+    found = surface_colors_at(gaussians, where, width, weights=weights)
+    return np.asarray(found.to(torch.float32).cpu().numpy())
+
+
+@torch.no_grad()
+def surface_colors_at(
+    gaussians: Gaussians, points: Tensor, width: float, *, weights: np.ndarray | None = None
+) -> Tensor:
+    """:func:`surface_colors` on the device of the splats.
+
+    ``points`` and the colours are float64 [M, 3].
+    """
+    device = gaussians.device
     if gaussians.labels is None:
-        rows = np.arange(gaussians.count)
+        rows = torch.arange(gaussians.count, device=device)
     else:
-        rows = (gaussians.labels == SURFACE).nonzero()[:, 0].cpu().numpy()
+        rows = (gaussians.labels == SURFACE).nonzero()[:, 0]
     if len(rows) == 0:
         raise InputError("no surface Gaussians: labels hold none", hint="run fill on a splat first")
-    alpha = gaussians.opacities.detach().double().cpu().numpy()[rows]
-    weight = alpha if weights is None else np.asarray(weights, dtype=np.float64)[rows]
+    if weights is None:
+        weight = gaussians.opacities.double()[rows]
+    else:
+        weight = torch.from_numpy(np.asarray(weights, dtype=np.float64)).to(device)[rows]
     solid = weight > (_FAINT if weights is None else 0.0)
-    if solid.sum() >= min(_NEIGHBOURS, len(rows)):
+    if int(solid.sum()) >= min(_NEIGHBOURS, len(rows)):
         rows, weight = rows[solid], weight[solid]
-    means = gaussians.means.detach()[torch.from_numpy(rows).to(gaussians.device)]
-    colors = gaussians.colors().detach().double().cpu().numpy()[rows].clip(0.0, 1.0)
+    means = gaussians.means[rows].double()
+    colors = gaussians.colors().double()[rows].clamp(0.0, 1.0)
     if len(points) == 0:
-        return np.zeros((0, 3), np.float32)
+        return points.new_zeros(0, 3)
     count = min(_NEIGHBOURS, len(rows))
-    distance, rank = nearest(means, points, count, width)
-    result = _robust_mean(distance, rank, weight, colors, width)
-    away = distance[:, 0] > _REACH * width
-    if away.any() and len(rows) > count:
+    parts, far = [], []
+    for some in points.split(16 * _CHUNK):
+        distance, rank = nearest_rows(means, some, count, width)
+        parts.append(_robust_mean(distance, rank, weight, colors, width))
+        far.append(distance[:, 0] > _REACH * width)
+    result = torch.cat(parts)
+    away = torch.cat(far).nonzero()[:, 0]
+    if len(rows) > count:
         # from every direction at about the same distance, or the nearest rim would draw rays
         wide = min(16 * _NEIGHBOURS, len(rows))
-        index = np.flatnonzero(away)
-        for first in range(0, len(index), _CHUNK):  # 10 kB a point: a GB for a side nobody saw
-            part = index[first : first + _CHUNK]
-            distance, rank = nearest(means, np.asarray(points)[part], wide, 4.0 * width)
+        for part in away.split(_CHUNK) if len(away) else ():  # 10 kB a point
+            distance, rank = nearest_rows(means, points[part], wide, 4.0 * width)
             spread = 0.35 * distance[:, :1] + width
             result[part] = _robust_mean(distance, rank, weight, colors, spread)
-    return result.astype(np.float32)
+    return result
 
 
 def _robust_mean(
-    distance: np.ndarray,
-    rank: np.ndarray,
-    weight: np.ndarray,
-    colors: np.ndarray,
-    width: float | np.ndarray,
-) -> np.ndarray:
+    distance: Tensor, rank: Tensor, weight: Tensor, colors: Tensor, width: float | Tensor
+) -> Tensor:
     """Weighted mean colours [M, 3] of neighbours [M, K], odd ones counting less."""
     # relative to the nearest one, so that points farther away still get a defined colour
     spread = (distance - distance[:, :1]) / width
-    share = (weight[rank] + 1e-6) * np.exp(-0.5 * spread**2)
+    share = (weight[rank] + 1e-6) * torch.exp(-0.5 * spread.square())
     color = colors[rank]
-    mean = np.einsum("nk,nkc->nc", share / share.sum(1, keepdims=True), color)
+
+    def mean(parts: Tensor) -> Tensor:
+        # one operation at a time: a matrix product may round by the shape of its batch
+        return (parts[..., None] * color).sum(dim=1) / parts.sum(dim=1, keepdim=True)
+
+    found = mean(share)
     for _ in range(2):
-        odd = ((color - mean[:, None]) ** 2).sum(-1)
-        kept = share / (1.0 + odd / _OUTLIER**2)
-        mean = np.einsum("nk,nkc->nc", kept / kept.sum(1, keepdims=True), color)
-    return mean
+        odd = (color - found[:, None]).square().sum(dim=2)
+        found = mean(share / (1.0 + odd / _OUTLIER**2))
+    return found
 
 
 @torch.no_grad()
