@@ -156,6 +156,32 @@ def lattice_links(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     return links, 6 - torch.bincount(links.reshape(-1), minlength=len(key))
 
 
+class _Ends:
+    """Sums over the links that end at each point, in the order of the links.
+
+    A GPU adds into one place in any order; there each point picks its own addends.
+    """
+
+    def __init__(self, links: Tensor, count: int) -> None:
+        self.a, self.b = links.unbind(dim=1)
+        self.count, self.addends = count, None
+        if links.is_cuda and count:
+            ends = torch.cat([self.a, self.b])
+            degree = torch.bincount(ends, minlength=count)
+            place = torch.arange(int(degree.max()), device=links.device)[:, None]
+            listed = torch.argsort(ends, stable=True)
+            listed = torch.cat([listed, listed.new_full((len(place) + 1,), len(ends))])
+            slot = degree.cumsum(0) - degree + place
+            self.addends = torch.where(place < degree, listed[slot], len(ends))
+
+    def sums(self, at_a: Tensor, at_b: Tensor) -> Tensor:
+        """Of what each link gives to its first and to its second end, [N]."""
+        if self.addends is None:
+            total = at_a.new_zeros(self.count).index_add(0, self.a, at_a)
+            return total.index_add(0, self.b, at_b)
+        return torch.cat([at_a, at_b, at_a.new_zeros(1)])[self.addends].sum(dim=0)
+
+
 class _Sides(NamedTuple):
     """Conductivity of the half of each point that faces something warmer, or colder, [N]."""
 
@@ -208,6 +234,7 @@ def conduct(
         TypeError: A tensor has a wrong dtype.
         ValueError: A shape, parameter, row or time is wrong.
 
+    Determinism: sums are in the order of the links, on both devices.
     Gradient: enthalpy, mass, rows, and the temperature of the wall.
     """
     op = "conduct"
@@ -218,16 +245,14 @@ def conduct(
     if not (math.isfinite(dt) and dt >= 0.0 and spacing > 0.0):
         raise ValueError(f"{op}: dt must not be negative and spacing positive, got {dt}, {spacing}")
     solid_k, liquid_k, solid_c, liquid_c, _, span, _ = _rows(op, rows, material, count)
-    a, b = links.unbind(dim=1)
+    ends, (a, b) = _Ends(links, count), links.unbind(dim=1)
     if share is not None:
         check_tensor(op, "share", share, shape=(len(links),), like=enthalpy)
     with torch.no_grad():
         most = torch.maximum(solid_k, liquid_k) * spacing
         part = torch.ones_like(most[a]) if share is None else share
-        through = torch.zeros_like(mass).index_add(0, a, part * most[b])
-        through = through.index_add(0, b, part * most[a])
-        faces = torch.zeros_like(mass).index_add(0, a, part).index_add(0, b, part)
-        through = torch.maximum(through, faces * most)
+        through = ends.sums(part * most[b], part * most[a])
+        through = torch.maximum(through, ends.sums(part, part) * most)
         if wall is not None:
             through = through.index_add(0, wall[0], 2.0 * most[wall[0]])
         if air is not None:
@@ -246,7 +271,7 @@ def conduct(
         flow = 2.0 * k_a * k_b / (k_a + k_b) * spacing * drop
         if share is not None:
             flow = share * flow
-        power = torch.zeros_like(mass).index_add(0, a, flow).index_add(0, b, -flow)
+        power = ends.sums(flow, -flow)
         if wall is not None:
             at, held = wall
             drop = held - warm[at]

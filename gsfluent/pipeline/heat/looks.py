@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.errors import InputError
 from gsfluent.pipeline.heat.ladder import LEVELS, at_level, thermal_of
-from gsfluent.pipeline.heat.touching import groups, touching, turned
+from gsfluent.pipeline.heat.touching import groups, summed, touching, turned
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.scene.heat import Surroundings
@@ -62,13 +61,9 @@ class Heat:
     Args:
         scene: The scene.
         matter: Its points, :func:`~gsfluent.pipeline.heat.ladder.thawing`.
-        deterministic: Whether the same bits are wanted.
-
-    Raises:
-        InputError: ``deterministic`` on a GPU, where sums of heat have no order.
     """
 
-    def __init__(self, scene: Scene, matter: Matter, *, deterministic: bool = False) -> None:
+    def __init__(self, scene: Scene, matter: Matter) -> None:
         self.matter, self.around = matter, scene.heat or Surroundings()
         self.floor = scene.floor
         self.spacing = matter.dx / POINTS_PER_CELL ** (1.0 / 3.0)
@@ -85,11 +80,6 @@ class Heat:
                 _Warm(body.name, slice(a, b), links.to(device), matter.rest[a:b].double(),
                       jitter.to(device), faces.to(device), table, body.temperature)
             )  # fmt: skip
-        if self._warm and deterministic and device.type == "cuda":
-            raise InputError(
-                "simulate: sums of heat have no order on a GPU, but deterministic was asked for",
-                hint="leave out solve.deterministic, or run on the CPU",
-            )
 
     def begun(self, state: State) -> State:
         """The state at time 0 with its heat."""
@@ -188,8 +178,7 @@ class Heat:
             if share is None or a not in first:
                 continue
             pairs = contact.pairs + links.new_tensor([first[a], first[b]])
-            for end in pairs.unbind(dim=1):
-                faces = faces.index_add(0, end, -contact.share.to(faces))
+            faces = faces - summed(contact.share.repeat(2), pairs.T.reshape(-1), len(faces))
             links, share = torch.cat([links, pairs]), torch.cat([share, contact.share.to(share)])
         faces = faces.clamp(min=0.0)
         wall = None

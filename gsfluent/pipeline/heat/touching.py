@@ -45,7 +45,7 @@ def touching(first: Tensor, second: Tensor, spacing: float) -> tuple[Tensor, Ten
         beyond = (distance**2 - distance[:, :1] ** 2) / spacing**2
         share = (1.0 - beyond).clamp(min=0.0) * (distance[:, :1] <= reach)
         share = 0.5 * share / share.sum(dim=1, keepdim=True).clamp(min=1e-9)
-        got = share.new_zeros(len(other)).index_add(0, index.reshape(-1), share.reshape(-1))
+        got = summed(share.reshape(-1), index.reshape(-1), len(other))
         share = share * (0.5 / got.clamp(min=0.5))[index]
         at, column = share.nonzero().unbind(dim=1)
         pair = torch.stack([rows[at], index[at, column]], dim=1)
@@ -54,6 +54,12 @@ def touching(first: Tensor, second: Tensor, spacing: float) -> tuple[Tensor, Ten
     if not pairs:
         return torch.zeros(0, 2, dtype=torch.int64, device=first.device), first.new_zeros(0)
     return torch.cat(pairs), torch.cat(shares)
+
+
+def summed(share: Tensor, at: Tensor, count: int) -> Tensor:
+    """Shares added up at points [count], in whole 2^-40: in any order the same."""
+    units = torch.round(share.double() * 2.0**40).long()
+    return units.new_zeros(count).index_add(0, at, units).to(share) * 2.0**-40
 
 
 def turned(rest: Tensor, now: Tensor) -> Tensor:

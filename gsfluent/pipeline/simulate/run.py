@@ -91,7 +91,7 @@ class Run:
     def _set(self, scene: Scene, matter: Matter) -> None:
         self.scene, self.matter = scene, matter
         self.impulses = Impulses(scene, matter)
-        self.heat = Heat(scene, matter, deterministic=self.stepper.options.deterministic)
+        self.heat = Heat(scene, matter)
         self._breakable = breakable(matter)
         # What flows runs apart and together again: it has no pieces.
         self._flowing = matter.of_law("fluid", "drucker_prager")
