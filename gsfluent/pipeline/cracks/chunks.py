@@ -32,7 +32,16 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
-from gsfluent.pipeline.cracks.followers import WIDE, Followers, Lent, chips, motions, neighbours
+from gsfluent.pipeline.cracks.followers import (
+    WIDE,
+    Followers,
+    Lent,
+    chips,
+    held,
+    motions,
+    neighbours,
+    stiff,
+)
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn, flows_at
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
@@ -83,6 +92,8 @@ class Chunks:
             [b.solid is not None for b in self._scene.bodies], device=self._body.device
         )
         self._may = solid[self._body] & ~flowing
+        never_bends = torch.tensor([stiff(b.material) for b in self._scene.bodies])
+        self._stiff = never_bends.to(self._body.device)[self._body] & self._may
         self.restore({})
 
     # --- a run that is taken up again ---
@@ -394,37 +405,44 @@ class Chunks:
     def _moved(self, points: Points) -> Points:
         """Points as they carry: pieces are chunks, and crumbs follow what is firm.
 
-        Broken matter has no shape to keep: it turns with its chunk. What hangs on next to nothing
-        says nothing about where the chunk is, so it is put where the firm points around it are.
+        Broken matter has no shape to keep: it turns with its chunk. What is stiff is never seen to
+        bend, however soft it is simulated: it goes with the rigid motion of its chunk. What hangs
+        on next to nothing says nothing about where the chunk is, so it is put where the firm points
+        around it are.
         """
         count = self._chunk.shape[0]
         broken = points.broken[:count] & self._may
         loose = (points.fragments[:count] < 0) & self._may
-        if not bool((broken | loose).any()):
+        if not bool((broken | loose | self._stiff).any()):
             return points
         chunk = points.fragments.clone()
         chunk[:count] = torch.where(self._may, self._chunk.to(chunk.dtype), chunk[:count])
-        position = points.position
+        position, rest, spacing = points.position, self.base.matter.rest, self.base.links.spacing
         drive = self._drives & self._may
         rigid = motions(
-            self._chunk[drive], self._regions, self.base.matter.rest[drive],
-            position[:count][drive], self.base.links.spacing[drive],
-        )  # fmt: skip
+            self._chunk[drive], self._regions, rest[drive], position[:count][drive], spacing[drive]
+        )
         turn = rigid.turn[self._chunk].to(points.map)
         bodies = len(self._scene.bodies)
         small = chips(self._chunk, self._may & ~self._gone, drive, self._regions, bodies)
         chip = self._may & small[self._chunk]
-        shapeless = (broken | loose | chip)[:, None, None]
+        firm = drive & ~self._crumb & self._stiff
+        whole = held(
+            rigid, self._chunk[firm], rest[firm], position[:count][firm], spacing[firm]
+        )[self._chunk].to(points.map)  # fmt: skip
+        shape = torch.where(broken | loose | chip, 1.0, torch.where(self._stiff, whole, 0.0))
         moved, rotation = points.map.clone(), points.rotation.clone()
-        moved[:count] = torch.where(shapeless, turn, moved[:count])
-        rotation[:count] = torch.where(shapeless, turn, rotation[:count])
+        moved[:count] = torch.lerp(moved[:count], turn, shape[:, None, None])
+        rotation[:count] = torch.lerp(rotation[:count], turn, shape[:, None, None])
         self._crumb = self._crumb | self._crumbs(position, chunk, points.broken)
         self._crumb = self._crumb | self._strayed(position, moved, broken)
         position = self._led(position, moved)
-        rows = chip.nonzero()[:, 0]
+        rows = (chip | self._stiff).nonzero()[:, 0]
         if rows.numel():
-            place = rigid.placed(self._chunk[rows], self.base.matter.rest[rows])
-            position = position.index_copy(0, rows, place.to(position))
+            place = rigid.placed(self._chunk[rows], rest[rows]).to(position)
+            share = torch.where(chip[rows], 1.0, whole[rows])
+            place = torch.lerp(position[rows], place, share[:, None])
+            position = position.index_copy(0, rows, place)
         return points._replace(position=position, fragments=chunk, map=moved, rotation=rotation)
 
     def _crumbs(self, position: Tensor, chunk: Tensor, broken: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import Material
 from gsfluent.pipeline.matter.links import PARTED, Links
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.partition.threshold import CHIP
@@ -18,6 +19,11 @@ from gsfluent.spatial.neighbours import nearest_in_group
 WIDE = 1.5
 """Width of the blend of neighbouring points where matter is broken, in point spacings: what is
 left of the crack band is rougher than a face."""
+HELD, YIELDS = 1.5, 3.0
+"""Root mean square way [spacings] of points from the rigid motion of their chunk up to which what
+is stiff is drawn rigid, and from which it is drawn as its points are."""
+STIFF = 3e-3
+"""Strain at which a material breaks below which its pieces are never seen to bend."""
 _FINE = 2.0**20
 
 
@@ -150,6 +156,14 @@ def chips(chunk: Tensor, there: Tensor, drive: Tensor, count: int, first: int) -
     return chip & driven
 
 
+def stiff(material: Material) -> bool:
+    """Whether nobody sees a piece of a material bend: glass, china, shell, stone.
+
+    What is simulated is softer for the sake of longer steps, and bends before it breaks.
+    """
+    return material.failure_strain / material.softening**0.5 < STIFF
+
+
 class Motions(NamedTuple):
     """Rigid motions of chunks.
 
@@ -167,6 +181,27 @@ class Motions(NamedTuple):
         """Where places [m], [M, 3], of these chunks, int64 [M], are now [m], float64 [M, 3]."""
         arm = rest.double() - self.rest[chunk]
         return self.now[chunk] + (self.turn[chunk].double() @ arm[..., None])[..., 0]
+
+
+def held(rigid: Motions, chunk: Tensor, rest: Tensor, now: Tensor, spacing: Tensor) -> Tensor:
+    """How far each chunk is held in shape, 0 to 1, [C].
+
+    All the way while its points are where its rigid motion takes them, but for some bending; what
+    has been crushed, or was never one piece, is not. Sums go in whole numbers: they have no order.
+
+    Args:
+        rigid: The motions.
+        chunk: Of firm points, int64 [D].
+        rest: Where they were at rest [m], [D, 3].
+        now: Where they are [m], [D, 3].
+        spacing: Between them [m], [D].
+    """
+    off = (rigid.placed(chunk, rest) - now.double()) / spacing.double()[:, None]
+    square = (off.square().sum(dim=1).clamp(max=_FINE) * _FINE).round().long()
+    count = rigid.turn.shape[0]
+    total = square.new_zeros(count).index_add_(0, chunk, square).double() / _FINE
+    many = torch.bincount(chunk, minlength=count).clamp(min=1).double()
+    return ((YIELDS - (total / many).sqrt()) / (YIELDS - HELD)).clamp(0.0, 1.0)
 
 
 def motions(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor) -> Motions:

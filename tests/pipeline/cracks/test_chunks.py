@@ -22,9 +22,9 @@ from gsfluent.pipeline.partition.tree import Partition
 from gsfluent.scene.scene import Scene
 
 
-def binding(device: str = "cpu") -> Carry:
+def binding(device: str = "cpu", material: str = "fruit.apple") -> Carry:
     scene = Scene(floor=None)
-    scene.add(ellipsoid(splats=600), materials.get("fruit.apple"))
+    scene.add(ellipsoid(splats=600), materials.get(material))
     return Carry.bind(scene, build_matter(scene, 0.03, device=device))
 
 
@@ -95,6 +95,26 @@ def test_a_chip_keeps_its_shape_where_its_points_run_apart(bound: Carry) -> None
     flown = whole[:, 0] > 1.0
     assert int(flown.sum()) > 20
     assert float((whole - scattered)[flown].norm(dim=1).max()) < 1e-3 * spacing
+
+
+@pytest.mark.parametrize("material", ["glass", "ceramic", "egg", "fruit.apple", "chocolate"])
+def test_shards_of_what_is_stiff_are_never_seen_to_bend(material: str) -> None:
+    """What is simulated softer bends by a point spacing; a shard of glass would look like a bar of
+    rubber. Fruit bends. What has been pressed flat is no longer in one piece, and is drawn so."""
+    bound = binding(material=material)
+    rest, spacing = bound.matter.rest, bound.matter.spacing[0]
+    far = rest[:, 0].abs().max()
+    right = bound.gaussians.means[:, 0] > 0.2 * far
+    away = torch.cdist(bound.gaussians.means[right], bound.gaussians.means[right])
+    strained = []
+    for bent in (2.0 * spacing / far**2, 40.0 * spacing / far**2):
+        history = Repair().begin(bound)
+        points = moment(bound, halves(bound), apart(bound, 0.2), bent=float(bent))
+        means = drawn(bound, history, points).gaussians.means[: len(right)][right]
+        strained.append(float((torch.cdist(means, means) - away).abs().max()))
+    holds = material in ("glass", "ceramic", "egg")
+    assert (strained[0] < 0.2 * spacing) == holds
+    assert strained[1] > 2.0 * spacing
 
 
 @pytest.mark.parametrize("bent", [0.0, 0.3])
