@@ -32,6 +32,8 @@ RIM = 2.5
 """How far from there the rim of a sheet is, in standard deviations of the blur."""
 APART = (1.0, 3.0)
 """What lies so many spacings before or behind what is around is a drop before or behind a sheet."""
+HELD = (0.1, 0.25)
+"""Share of liquid around a drop from which on it hangs on a sheet, and where it is its rim."""
 _COARSE = 2.0  # pixels per standard deviation that a blur needs
 _LEAST = 1e-3
 
@@ -73,7 +75,8 @@ def closed(
     spread = (mean[..., 1] - mean[..., 0] ** 2).clamp(min=0.0)
     flat = torch.exp(-spread / SHEET**2)
     apart = (mixed[..., 0] - mean[..., 0]).abs()
-    rim = _ramp(_widened(much, sigma), INSIDE) * flat * (1.0 - _ramp(apart, APART))
+    rim = _ramp(_widened(much, sigma), INSIDE) * _ramp(much, HELD)
+    rim = rim * flat * (1.0 - _ramp(apart, APART))
     splats = covered(surface, spacing, camera)[window]
     cover = torch.lerp(torch.maximum(splats, full * flat), full, rim)
     made = Surface(

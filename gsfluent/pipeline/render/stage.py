@@ -186,7 +186,8 @@ class Render(Stage):
             lit, room = self._light(dense, camera, lighting, everything, room)
             extras = splat_normals(gaussians, lit.grid, eye)
             if plates is not None:
-                extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
+                flat = plates.nonzero()[:, 0]
+                extras = extras.index_copy(0, flat, plate_normals(gaussians.select(flat), eye))
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         layers: list[Tensor | None] = [None]
