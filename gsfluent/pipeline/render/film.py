@@ -133,6 +133,7 @@ class Film:
             time=frame.time,
             room=self._room,
             clear=clear_of(frame),
+            wet=wet,
         )
         if clear is not None:
             # what is seen through glass is no hole in it
