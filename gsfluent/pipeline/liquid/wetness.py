@@ -21,7 +21,7 @@ from gsfluent.pipeline.liquid.clear import Clear
 from gsfluent.results.frames import DUST, SavedFrame
 from gsfluent.spatial.neighbours import nearest_rows
 
-TOUCH = (2.0, 3.0)
+TOUCH = (1.8, 2.5)
 """Distance of the nearest point of a liquid up to which it touches skin, and from which on it does
 not, in spacings: contact on the grid keeps it 1.2 to 2.1 off what lies in it."""
 DRIES = 30.0

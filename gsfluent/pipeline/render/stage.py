@@ -447,7 +447,9 @@ def _wetted(
     surface, there = liquid.surface, liquid.there
     cover = surface.alpha
     # what hides an opaque body hides its surface, of a clear one its splats in their order
-    scale = there if liquid.opaque else torch.minimum(cover, 1.0 / liquid.body[..., 3].clamp(min=1e-6))
+    scale = (
+        there if liquid.opaque else torch.minimum(cover, 1.0 / liquid.body[..., 3].clamp(min=1e-6))
+    )
     body = (liquid.body * scale[..., None]).masked_fill(liquid.done[..., None], 0.0)
     taken, color, shine = body[..., 3], body[..., :3], None
     if lit is not None:
