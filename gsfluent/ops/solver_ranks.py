@@ -23,8 +23,8 @@ MAIL_WORDS = 11
 
 _POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
            "place", "viscous", "own")  # fmt: skip
-_MOVING = ("colliders", "collider_state", "impulse")
-_STATIC = ("law", "rows", "sdf", "parent", "cut")
+_MOVING = ("colliders", "collider_state", "impulse", "spring_rows")
+_STATIC = ("law", "rows", "sdf", "parent", "cut", "radius", "object")
 
 
 def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> list[torch.device]:
@@ -138,7 +138,7 @@ class Parts:
             points, homes, slots = (
                 int(clock[layout.INDEX[name]]) for name in ("cursor", "homes", "slots")
             )
-            holders = part.holders[part.slot_next[:slots].long()]
+            holders = part.holders[part.table_count[:slots].long()]
             shared = int((holders != torch.ones_like(holders) << rank).sum())
             rows.append({"points": points, "homes": homes, "slots": slots, "shared": shared})
         return rows
