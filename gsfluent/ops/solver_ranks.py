@@ -61,6 +61,13 @@ def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> 
         raise InputError(
             f"Solver: devices: at most {MOST_RANKS}, got {len(found)}", hint="name fewer"
         )
+    for device in found:
+        for other in found:
+            if device != other and not torch.cuda.can_device_access_peer(device, other):
+                raise InputError(
+                    f"Solver: devices: {device} cannot reach the memory of {other}",
+                    hint="name devices that are linked; `nvidia-smi topo -p2p r` shows which",
+                )
     if home not in found:
         raise InputError(
             f"Solver: the points lie on {home}, which is none of devices",

@@ -44,6 +44,8 @@ LOOK = 8
 """Steps between two looks at how fast matter is, while a collider is much faster."""
 STEADY = 0.9
 """Factor on the time step above which that need not be."""
+WORTH_DEVICES = 400_000
+"""Points from which several GPUs may be faster than one (docs/theory/ranks.md)."""
 OUTWEIGHS = 0.5
 """Least mass of a free body for the resident solver, in masses of the matter that it can touch:
 what it strikes first lies on one side of it."""
@@ -185,6 +187,9 @@ class Resident:
         )  # fmt: skip
         if not matter.has_field:
             constants["flip"] = options.flip
+        there = torch.cuda.device_count() if p.device.type == "cuda" else 1
+        if options.all_devices and there > 1 and len(p.mass) >= WORTH_DEVICES:
+            constants["devices"] = [f"cuda:{i}" for i in range(there)]
         if options.surface:
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(
