@@ -180,7 +180,7 @@ class Resident:
             LAWS["nacc"],
         }
         self._damage = not set(law.tolist()) <= {LAWS["elastic"]}  # as the solver decides it
-        constants = dict(
+        constants: dict[str, Any] = dict(
             mass=p.mass, volume=p.volume, dx=matter.dx, law=law, params=params,
             material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
             cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
@@ -196,7 +196,7 @@ class Resident:
                 torch.tensor([end - start for start, end in matter.ranges])
             )
             self._object = at_rows(which.to(p.device), rows)
-        self._constants: dict[str, Any] = constants
+        self._constants = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale
         self._start = self.time = state.time
