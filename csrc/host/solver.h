@@ -397,7 +397,6 @@ struct SolverOps {
         STD_TORCH_CHECK(s.peers != nullptr && s.holders != nullptr && s.needers != nullptr &&
                             s.mail != nullptr && s.home_rank != nullptr && s.home_place != nullptr,
                         "solver: ranks need peers, holders, needers, mail, home_rank, home_place");
-      STD_TORCH_CHECK(all.radius == nullptr, "solver: ranks on CUDA do not know radius");
       STD_TORCH_CHECK(all.count <= int64_t(1) << 26, "solver: at most 2^26 points");
       f(std::move(views), like);
     });

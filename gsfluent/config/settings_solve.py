@@ -124,6 +124,14 @@ class SolveSettings:
         "points",
         default="nodes",
     )
+    devices: str = key(
+        choice("one", "all"),
+        "`all`: where the grid holds 400000 points or more, all GPUs of this machine work at it, "
+        "each at a part, with the bits of one. They must reach each other's memory. On a CPU, and "
+        "where there is one GPU, no difference.",
+        "all",
+        default="one",
+    )
     loose_debris: bool = key(
         flag,
         "Does nothing any more: loose matter leaves the grid in every shot.",

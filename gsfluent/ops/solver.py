@@ -250,7 +250,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
-        self.ranks = self._ranks(ranks, devices, radius is not None)
+        self.ranks = self._ranks(ranks, devices)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -355,7 +355,7 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(self, ranks: int, devices: Sequence[str | torch.device] | None, pushed: bool) -> int:
+    def _ranks(self, ranks: int, devices: Sequence[str | torch.device] | None) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
         if devices is not None:
             self.devices = check_devices(devices, self.device)
@@ -375,7 +375,6 @@ class Solver(SolverState):
         unknown = {
             f"device {self.device.type}": self.device.type not in ("cpu", "cuda"),
             "law phase_field (9)": self._law_set == DAMAGE_FIELD,
-            "radius on CUDA": pushed and self.device.type == "cuda",
         }
         found = [name for name, used in unknown.items() if used]
         if ranks > 1 and found:

@@ -160,7 +160,8 @@ class Buffers:
         device = self.offset.device
         for name in ("home_rank", "home_place"):
             old, new = getattr(self, name), torch.zeros(homes, dtype=torch.int32, device=device)
-            new[: old.shape[0]] = old
+            kept = min(old.shape[0], homes)
+            new[:kept] = old[:kept]
             setattr(self, name, new)
         self.holders = torch.zeros(slots, dtype=torch.int64, device=device)
         self.needers = torch.zeros_like(self.holders)

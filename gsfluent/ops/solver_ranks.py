@@ -23,8 +23,8 @@ MAIL_WORDS = 11
 
 _POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
            "place", "viscous", "own")  # fmt: skip
-_MOVING = ("colliders", "collider_state", "impulse")
-_STATIC = ("law", "rows", "sdf", "parent", "cut")
+_MOVING = ("colliders", "collider_state", "impulse", "spring_rows")
+_STATIC = ("law", "rows", "sdf", "parent", "cut", "radius", "object")
 
 
 def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> list[torch.device]:
@@ -61,6 +61,13 @@ def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> 
         raise InputError(
             f"Solver: devices: at most {MOST_RANKS}, got {len(found)}", hint="name fewer"
         )
+    for device in found:
+        for other in found:
+            if device != other and not torch.cuda.can_device_access_peer(device, other):
+                raise InputError(
+                    f"Solver: devices: {device} cannot reach the memory of {other}",
+                    hint="name devices that are linked; `nvidia-smi topo -p2p r` shows which",
+                )
     if home not in found:
         raise InputError(
             f"Solver: the points lie on {home}, which is none of devices",
@@ -138,7 +145,7 @@ class Parts:
             points, homes, slots = (
                 int(clock[layout.INDEX[name]]) for name in ("cursor", "homes", "slots")
             )
-            holders = part.holders[part.slot_next[:slots].long()]
+            holders = part.holders[part.table_count[:slots].long()]
             shared = int((holders != torch.ones_like(holders) << rank).sum())
             rows.append({"points": points, "homes": homes, "slots": slots, "shared": shared})
         return rows

@@ -132,6 +132,7 @@ def solver_options(shot: Shot) -> SolverOptions:
         standing=solve.standing,
         deterministic=solve.deterministic,
         surface=solve.contact == "points",
+        all_devices=solve.devices == "all",
     )
 
 

@@ -4,10 +4,10 @@ python scripts/bench/mpm.py                                    # this machine's 
 python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md  # one core
 python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
-python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136 --markdown docs/measured/benchmarks.md
+python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136
 
-With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the bits
-of one. Each call's way of the points to the devices and back is in the time of its 100 steps.
+With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the
+bits of one. The way of the points to the devices and back is in the time of each 100 steps.
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
 eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
@@ -176,7 +176,7 @@ def scaling(n: int, cells: int, counts: list[int]) -> list[dict[str, Any]]:
 
 def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
     lines = [
-        f"Device: {name}; torch {torch.__version__}. Elastic, lattice; whole steps, builds included.",
+        f"Device: {name}; torch {torch.__version__}. Elastic, lattice. Whole steps, with builds.",
         "",
         "| points | devices | ms | times the first | bits of the first | shared blocks |",
         "| --- | --- | --- | --- | --- | --- |",

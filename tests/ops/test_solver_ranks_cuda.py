@@ -18,9 +18,7 @@ pytestmark = [
     pytest.mark.skipif(not has_cuda(), reason="needs a GPU and gsfluent's CUDA kernels"),
 ]
 STEPS = 40
-UNKNOWN = ("radius", "objects", "objects on each other")
-"""Cases that ranks on CUDA refuse."""
-KNOWN = [name for name in CASES if name not in (*UNKNOWN, "metal with a rate")]
+KNOWN = [name for name in CASES if name != "metal with a rate"]  # which has kernels on a CPU only
 PEERS = 4
 """Devices used at most."""
 
@@ -143,12 +141,6 @@ def test_the_same_failure_at_the_same_step() -> None:
             run(given, ranks=ranks, dt=6e-3)
         told.append(str(failure.value))
     assert told[0] == told[1]
-
-
-@pytest.mark.parametrize("name", UNKNOWN)
-def test_what_ranks_on_cuda_do_not_know_is_refused_by_name(name: str) -> None:
-    with pytest.raises(InputError, match="2 ranks do not know radius on CUDA yet"):
-        ops.Solver(**here(CASES[name](torch.float32)), ranks=2)
 
 
 @pytest.mark.parametrize(

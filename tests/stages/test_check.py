@@ -72,6 +72,14 @@ def test_what_can_be_passes(splats: Path, changes: dict[str, Any]) -> None:
     check_shot(shot(splats, **changes))
 
 
+def test_all_devices_leave_the_motion_as_it_is(splats: Path) -> None:
+    every = shot(splats, solve={"devices": "all"})
+    assert solver_options(every).all_devices and not solver_options(shot(splats)).all_devices
+    assert moving_settings(every) == moving_settings(shot(splats))
+    with pytest.raises(InputError, match=r"solve.devices.*one.*all"):
+        shot(splats, solve={"devices": "two"})
+
+
 def test_points_are_pushed_where_they_can_be(splats: Path) -> None:
     pushed = shot(splats, solve={"contact": "points"})
     assert solver_options(pushed).surface and not solver_options(shot(splats)).surface

@@ -213,6 +213,7 @@ __global__ void __launch_bounds__(kThreads) copy_kernel(const __grid_constant__ 
     s.site_slots[kSiteFields * i + f] = all.site_slots[kSiteFields * i + f];
   s.slot_shared[i] = all.slot_shared[i];
   s.slot_near[i] = all.slot_near[i];
+  s.slot_next[i] = all.slot_next[i];
 }
 
 __device__ void join_bits(uint64_t* to, uint64_t bits) {
@@ -257,7 +258,8 @@ __global__ void __launch_bounds__(kThreads) hold_kernel(const __grid_constant__ 
   }
 }
 
-// What a rank holds of all slots, and the shared sites that it needs.
+// What a rank holds of all slots (in `table_count`, whose other work is done), and the shared sites
+// that it needs.
 template <typename T>
 __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ SolverView<T> s,
                                                         const __grid_constant__ SolverView<T> all) {
@@ -268,7 +270,7 @@ __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ 
     s.holders[i] = holders;
     s.needers[i] = all.needers[i];
     if ((holders >> s.rank & 1u) != 0)
-      s.slot_next[add(&s.clock->wanted_slots, 1)] = static_cast<int32_t>(i);
+      s.table_count[add(&s.clock->wanted_slots, 1)] = static_cast<int32_t>(i);
   }
   if (i >= all.clock->shared_sites) return;
   const int32_t site = all.table_mask[i];
@@ -399,6 +401,11 @@ cudaError_t ranks_step(const Fleet<T>& fleet, int law_set) {
         [](const SolverView<T>& s, cudaStream_t stream) { solver_free_to_nodes(s, stream); });
     meet();
     fleet.each([](const SolverView<T>& s, cudaStream_t stream) { solver_free_nodes(s, stream); });
+    meet();
+  }
+  for (int part = 0; part < points_parts(fleet.all()); ++part) {
+    fleet.each(
+        [&](const SolverView<T>& s, cudaStream_t stream) { solver_points(s, part, stream); });
     meet();
   }
   fleet.each([](const SolverView<T>& s, cudaStream_t stream) { solver_to_nodes(s, stream); });

@@ -14,7 +14,7 @@ constexpr unsigned kSharedCtas = 2048;  // of the kernels that only shared block
 // The i-th slot that is held here. Slots have the same number on all ranks, which list their own.
 template <typename T>
 __device__ int64_t held_slot(const SolverView<T>& s, int64_t i) {
-  return s.peers == nullptr ? i : s.slot_next[i];
+  return s.peers == nullptr ? i : s.table_count[i];
 }
 
 // Reads the sums of one node.
@@ -209,9 +209,10 @@ __device__ __noinline__ void hold_near(const SolverView<T>& s, int fields, const
 // Friction where colliders push points, for all lanes of a warp together: node(f) is that of the
 // f-th field. Out of line likewise.
 template <typename T, typename Number, typename Mass, typename Node>
-__device__ __noinline__ void rub_near(const SolverView<T>& s, HeldSums& held, int fields,
-                                      const bool* heavy, const Number& number, const Mass& mass,
-                                      const Node& node, const Vec3<T>& x, Vec3<T>* velocity) {
+__device__ __noinline__ void rub_near(const SolverView<T>& s, HeldSums& held, bool answers,
+                                      int fields, const bool* heavy, const Number& number,
+                                      const Mass& mass, const Node& node, const Vec3<T>& x,
+                                      Vec3<T>* velocity) {
   double sums[kImpulseSums] = {};
   int64_t k = -1;
   const double unit = given_unit(s, kPush);
@@ -223,7 +224,7 @@ __device__ __noinline__ void rub_near(const SolverView<T>& s, HeldSums& held, in
     return sums;
   };
   node_rub(s, fields, heavy, number, mass, push, x, nearest, account, velocity);
-  for (unsigned left = __ballot_sync(kAllLanes, k >= 0); left != 0;) {
+  for (unsigned left = __ballot_sync(kAllLanes, answers && k >= 0); left != 0;) {
     const int64_t one = __shfl_sync(kAllLanes, static_cast<long long>(k), __ffs(left) - 1);
     double own[kImpulseSums];
     for (int i = 0; i < kImpulseSums; ++i) own[i] = k == one ? sums[i] : 0.0;
@@ -331,7 +332,7 @@ __device__ __forceinline__ void contact_site(const SolverView<T>& s, int64_t sit
   }
   if constexpr (kPoints) {
     if ((given_any & kPushed) != 0)
-      rub_near(s, held, count, heavy, number, mass, node_of, x, velocity);
+      rub_near(s, held, answers, count, heavy, number, mass, node_of, x, velocity);
     for (int f = 0; f < count; ++f) store_velocity(s.node_velocity, node_of(f), velocity[f]);
   }
   if (touched > 0 && answers) add_units(&s.clock->touched, 1);  // nodes, not pairs
@@ -383,7 +384,7 @@ __device__ void update_slot(const SolverView<T>& s, HeldSums& held, int64_t slot
           node_place(s.slot_coord + 4 * slot, T(local / 16), T(local / 4 % 4), T(local % 4), s.dx);
       const auto number = [&](int) { return s.slot_coord[4 * slot + 3]; };
       const auto mass = [&](int) { return sums.mass; };
-      rub_near(s, held, 1, &heavy, number, mass, [&](int) { return node; }, x, &v);
+      rub_near(s, held, s.answers(slot), 1, &heavy, number, mass, [&](int) { return node; }, x, &v);
     }
     clear_given(s, node, given);
   }

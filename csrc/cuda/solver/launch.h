@@ -37,10 +37,16 @@ void solver_end(const SolverView<T>& s, cudaStream_t stream);
 // Points that keep a share of their own motion: g2p (solver_free_to_nodes came before).
 template <typename T>
 void solver_keep(const SolverView<T>& s, int law_set, cudaStream_t stream);
-// Points that are pushed: what of their rows a step needs, and what they get in one.
+// Points that are pushed: what of their rows a step needs, and what they get in one, in parts
+// between which several ranks wait for each other.
 template <typename T>
 void solver_spring_rows(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
-void solver_points(const SolverView<T>& s, cudaStream_t stream);
+int points_parts(const SolverView<T>& s) {
+  if (s.radius == nullptr) return 0;
+  return s.object != nullptr && s.moments != nullptr ? 4 : 2;
+}
+template <typename T>
+void solver_points(const SolverView<T>& s, int part, cudaStream_t stream);
 
 }  // namespace gsf::cuda

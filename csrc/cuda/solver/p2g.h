@@ -125,19 +125,26 @@ struct ParticleGiven {
   }
 };
 
-// Adds the words of one node, times 2^shift, to `kWords` sums of it: on this rank, and on all
-// others that hold its slot (sums(view) = their array).
+// Calls f(view) of the other ranks among these bits.
+template <typename T, typename F>
+__device__ __forceinline__ void for_others_of(const SolverView<T>& s, uint64_t ranks, const F& f) {
+  if (ranks != 0) ranks &= ~(uint64_t(1) << s.rank);
+  for (; ranks != 0; ranks &= ranks - 1) f(s.peers[__ffsll(static_cast<long long>(ranks)) - 1]);
+}
+
+// Adds units(c) to the `kWords` sums of a node: on this rank, and on all others that hold its slot
+// (sums(view) = their array).
 template <int kWords, typename T, typename Units, typename Sums>
 __device__ __forceinline__ void give_node(const SolverView<T>& s, int64_t node, const Units& units,
                                           const Sums& sums) {
-  uint64_t others = 0;
-  if (s.peers != nullptr) others = s.holders[node / kBlockNodes] & ~(uint64_t(1) << s.rank);
+  const uint64_t holders = s.peers == nullptr ? 0 : s.holders[node / kBlockNodes];
   for (int c = 0; c < kWords; ++c) {
     const long long v = units(c);
     if (v == 0) continue;
     add_units(sums(s) + kWords * node + c, v);
-    for (uint64_t left = others; left != 0; left &= left - 1)
-      add_units(sums(s.peers[__ffsll(static_cast<long long>(left)) - 1]) + kWords * node + c, v);
+    for_others_of(s, holders, [&](const SolverView<T>& other) {
+      add_units(sums(other) + kWords * node + c, v);
+    });
   }
 }
 

@@ -94,6 +94,19 @@ __device__ void note_given(const SolverView<T>& s, int which, int64_t home, floa
   if ((threadIdx.x & 31) == 0) raise_to(given_bound(s, which), bits);
 }
 
+template <typename T>
+__device__ void note_slot(const SolverView<T>& s, int which, int64_t slot) {
+  int32_t* note = s.slot_given + slot;
+  if ((*static_cast<volatile int32_t*>(note) >> which & 1) == 0) atomicOr(note, 1 << which);
+}
+// Of several ranks: the largest number that any of them gives.
+template <typename T>
+__global__ void agree_kernel(const __grid_constant__ SolverView<T> s, int which) {
+  if (!may_step(*s.clock)) return;
+  for (int q = 0; q < s.ranks; ++q)
+    raise_to(given_bound(s, which), static_cast<unsigned>(*given_bound(s.peers[q], which)));
+}
+
 // Adds what the points of a home are given to the nodes of its window.
 struct GivenWindow {
   unsigned long long sums[4][kTile];
@@ -123,20 +136,18 @@ __device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, Gi
     });
   }
   __syncthreads();
-  int64_t* out = which == kPush ? s.push : s.press;
   for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
     int i, j, k;
     const int at = window_node(index, i, j, k);
     const int64_t node = slot_node(window.neighbour, i, j, k);
-    bool any = false;
-    for (int c = 0; c < 4 && node >= 0; ++c) {
-      if (window.sums[c][at] == 0) continue;
-      add_units(out + 4 * node + c, static_cast<long long>(window.sums[c][at]));
-      any = true;
-    }
-    int32_t* note = s.slot_given + node / kBlockNodes;
-    if (any && (*static_cast<volatile int32_t*>(note) >> which & 1) == 0)
-      atomicOr(note, 1 << which);
+    if (node < 0) continue;
+    const auto units = [&](int c) { return static_cast<long long>(window.sums[c][at]); };
+    if ((units(0) | units(1) | units(2) | units(3)) == 0) continue;
+    give_node<4>(s, node, units,
+                 [&](const SolverView<T>& v) { return which == kPush ? v.push : v.press; });
+    note_slot(s, which, node / kBlockNodes);
+    for_others_of(s, s.peers == nullptr ? 0 : s.holders[node / kBlockNodes],
+                  [&](const SolverView<T>& v) { note_slot(v, which, node / kBlockNodes); });
   }
 }
 
@@ -222,6 +233,14 @@ __device__ bool may_touch(const bool* shared, uint32_t meta) {
   return any;
 }
 
+// Calls f(view) of those whose points may lie in cells of a slot: the ranks that need it.
+template <typename T, typename F>
+__device__ void for_needers(const SolverView<T>& s, int64_t slot, const F& f) {
+  if (s.peers == nullptr) return f(s);
+  for (uint64_t left = s.needers[slot]; left != 0; left &= left - 1)
+    f(s.peers[__ffsll(static_cast<long long>(left)) - 1]);
+}
+
 // Calls f(home) for the homes whose windows touch shared blocks, whole CTAs together. bound_kernel
 // has listed them in `entry`.
 template <typename T, typename F>
@@ -292,7 +311,10 @@ struct Around {
     for (int index = threadIdx.x; index < kWindowNodes; index += kThreads) {
       const int at[3] = {index / 64 - 1, index / 8 % 8 - 1, index % 8 - 1};
       bool here = false;
-      for_cell(at, [&](int64_t node) { here = here || *cell_head(s, node) != 0; });
+      for_cell(at, [&](int64_t node) {
+        for_needers(s, node / kBlockNodes,
+                    [&](const SolverView<T>& v) { here = here || *cell_head(v, node) != 0; });
+      });
       filled[index] = here;
       any = any || here;
     }
@@ -307,28 +329,32 @@ struct Around {
   }
 };
 
-// Calls f(q, d, r2) for the points of other objects near one. The order is any.
+// Calls f(view, q, d, r2) for the points of other objects near one, which `view` holds. The order
+// is any.
 template <typename T, typename F>
 __device__ void for_others(const SolverView<T>& s, const Around& around, uint32_t meta,
                            const T* place, const F& f) {
-  const int32_t* next = Room<T>(s).next;
   for (int o = 0; o < kNeighbours; ++o) {
     int at[3];
     for (int axis = 0; axis < 3; ++axis)
       at[axis] = min(meta_cell(meta, axis), kLastCell) + neighbour_step(o, axis);
     if (!around.filled[((at[0] + 1) * 8 + at[1] + 1) * 8 + at[2] + 1]) continue;
-    around.for_cell(at, [&](int64_t node) {
-      int64_t q = int64_t(*cell_head(s, node)) - 1;
-      for (int64_t tries = 0; q >= 0 && q < s.count && tries < s.count; ++tries, q = next[q]) {
+    const auto walk = [&](const SolverView<T>& v, int64_t node) {
+      const int32_t* next = Room<T>(v).next;
+      int64_t q = int64_t(*cell_head(v, node)) - 1;
+      for (int64_t tries = 0; q >= 0 && q < v.count && tries < v.count; ++tries, q = next[q]) {
         T offset[3];
-        load_place(s, q, offset);
+        load_place(v, q, offset);
         double d[3], r2 = 0.0;
         for (int axis = 0; axis < 3; ++axis) {
           d[axis] = double(place[axis]) - double(offset[axis]) - neighbour_step(o, axis);
           r2 += d[axis] * d[axis];
         }
-        if (r2 < kTouchReach * kTouchReach) f(q, d, r2);
+        if (r2 < kTouchReach * kTouchReach) f(v, q, d, r2);
       }
+    };
+    around.for_cell(at, [&](int64_t node) {
+      for_needers(s, node / kBlockNodes, [&](const SolverView<T>& v) { walk(v, node); });
     });
   }
 }
@@ -367,17 +393,18 @@ __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ 
       const double velocity[3] = {double(speed[0]) / dx, double(speed[1]) / dx,
                                   double(speed[2]) / dx};
       long long share = 0, stiffness = 0, rate = 0;
-      for_others(s, around, meta, place, [&](int64_t q, const double* d, double r2) {
-        T speed_q[3];
-        load_speed(s, q, speed_q);
-        const double velocity_q[3] = {double(speed_q[0]) / dx, double(speed_q[1]) / dx,
-                                      double(speed_q[2]) / dx};
-        TouchFound found{0.0, 0.0, 0.0};
-        add_found(matter_of(s, load_meta(s, q)), d, r2, velocity, velocity_q, found);
-        share += units_of(found.share, 1.0 / kShareUnit);
-        stiffness += units_of(found.stiffness, per_stiffness);
-        rate += units_of(found.rate, per_rate);
-      });
+      for_others(s, around, meta, place,
+                 [&](const SolverView<T>& v, int64_t q, const double* d, double r2) {
+                   T speed_q[3];
+                   load_speed(v, q, speed_q);
+                   const double velocity_q[3] = {double(speed_q[0]) / dx, double(speed_q[1]) / dx,
+                                                 double(speed_q[2]) / dx};
+                   TouchFound found{0.0, 0.0, 0.0};
+                   add_found(matter_of(s, load_meta(v, q)), d, r2, velocity, velocity_q, found);
+                   share += units_of(found.share, 1.0 / kShareUnit);
+                   stiffness += units_of(found.stiffness, per_stiffness);
+                   rate += units_of(found.rate, per_rate);
+                 });
       const TouchFound sum{double(share) * kShareUnit, double(stiffness) * stiffness_unit,
                            double(rate) * rate_unit};
       double energy = 0.0;
@@ -409,13 +436,15 @@ __global__ void __launch_bounds__(kThreads) press_kernel(const __grid_constant__
       long long units[3] = {0, 0, 0};
       if (may_touch(around.shared, meta)) {
         const double energy = room.energy[p], volume = matter_of(s, meta).volume;
-        for_others(s, around, meta, place, [&](int64_t q, const double* d, double r2) {
-          const double energy_q = room.energy[q];
-          if (energy == 0.0 && energy_q == 0.0) return;
-          const double force =
-              touch_force(energy, volume, energy_q, matter_of(s, load_meta(s, q)).volume, r2);
-          for (int axis = 0; axis < 3; ++axis) units[axis] += units_of(force * d[axis], per_unit);
-        });
+        for_others(s, around, meta, place,
+                   [&](const SolverView<T>& v, int64_t q, const double* d, double r2) {
+                     const double energy_q = Room<T>(v).energy[q];
+                     if (energy == 0.0 && energy_q == 0.0) return;
+                     const double force = touch_force(energy, volume, energy_q,
+                                                      matter_of(s, load_meta(v, q)).volume, r2);
+                     for (int axis = 0; axis < 3; ++axis)
+                       units[axis] += units_of(force * d[axis], per_unit);
+                   });
       }
       double sum[3];
       T given[4];
@@ -444,25 +473,30 @@ void solver_spring_rows(const SolverView<T>& s, cudaStream_t stream) {
 }
 
 template <typename T>
-void solver_points(const SolverView<T>& s, cudaStream_t stream) {
+void solver_points(const SolverView<T>& s, int part, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
-  cudaMemsetAsync(s.spring_rows + 2 * (s.row_count + 1), 0, 2 * sizeof(uint64_t), stream);
-  cudaMemsetAsync(s.slot_given, 0, s.slot_capacity * sizeof *s.slot_given, stream);
-  if (s.collider_count > 0) {
-    push_kernel<T><<<homes, kThreads, 0, stream>>>(s);
-    push_scatter_kernel<T><<<homes, kThreads, 0, stream>>>(s);
-  }
-  if (s.object == nullptr || s.moments == nullptr) return;
   const unsigned shared = min(homes, kSharedCtas);
-  list_kernel<T><<<shared, kThreads, 0, stream>>>(s);
-  find_kernel<T><<<shared, kThreads, 0, stream>>>(s);
-  press_kernel<T><<<shared, kThreads, 0, stream>>>(s);
-  press_scatter_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  const bool touch = points_parts(s) > 2;
+  if (s.peers != nullptr && part % 2 == 1)
+    agree_kernel<T><<<1, 1, 0, stream>>>(s, part == 1 ? kPush : kPress);
+  if (part == 0) {
+    cudaMemsetAsync(s.spring_rows + 2 * (s.row_count + 1), 0, 2 * sizeof(uint64_t), stream);
+    cudaMemsetAsync(s.slot_given, 0, s.slot_capacity * sizeof *s.slot_given, stream);
+    if (s.collider_count > 0) push_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    if (touch) list_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  } else if (part == 1) {
+    if (s.collider_count > 0) push_scatter_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    if (touch) find_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  } else if (part == 2) {
+    press_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  } else {
+    press_scatter_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+  }
 }
 
 #define GSF_INSTANTIATE(T)                                                 \
   template void solver_spring_rows<T>(const SolverView<T>&, cudaStream_t); \
-  template void solver_points<T>(const SolverView<T>&, cudaStream_t);
+  template void solver_points<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)
 #undef GSF_INSTANTIATE

@@ -154,7 +154,7 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
     solver_free_to_nodes(s, stream);
     solver_free_nodes(s, stream);
   }
-  if (s.radius != nullptr) solver_points(s, stream);
+  for (int part = 0; part < points_parts(s); ++part) solver_points(s, part, stream);
   solver_to_nodes(s, stream);
   solver_from_nodes(s, law_set, stream);
   return cudaGetLastError();

@@ -105,6 +105,8 @@ class SolverOptions:
             on floors and on each other and not up to 1.5 cells above them (docs/theory/colliders.md
             and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver
             only; the composed operators hold nodes.
+        all_devices: Step scenes of many points on all GPUs of this machine, with the bits of one
+            (docs/theory/ranks.md); the resident solver on a GPU only.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
             ``implicit``).
         max_rollbacks: Roll-backs in a row before the run is given up.
@@ -125,6 +127,7 @@ class SolverOptions:
     deterministic: bool = False
     standing: bool = False
     surface: bool = False
+    all_devices: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
 

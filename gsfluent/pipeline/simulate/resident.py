@@ -44,6 +44,8 @@ LOOK = 8
 """Steps between two looks at how fast matter is, while a collider is much faster."""
 STEADY = 0.9
 """Factor on the time step above which that need not be."""
+WORTH_DEVICES = 400_000
+"""Points from which several GPUs may be faster than one (docs/theory/ranks.md)."""
 OUTWEIGHS = 0.5
 """Least mass of a free body for the resident solver, in masses of the matter that it can touch:
 what it strikes first lies on one side of it."""
@@ -194,20 +196,23 @@ class Resident:
             LAWS["nacc"],
         }
         self._damage = not set(law.tolist()) <= {LAWS["elastic"]}  # as the solver decides it
-        constants = dict(
+        constants: dict[str, Any] = dict(
             mass=p.mass, volume=p.volume, dx=matter.dx, law=law, params=params,
             material=p.material, gravity=scene.gravity, sdf=rigid.sdf, friction=scene.friction,
             cfl=options.cfl, irreversible=options.irreversible, **options.return_map,
         )  # fmt: skip
         if not matter.has_field:
             constants["flip"] = options.flip
+        there = torch.cuda.device_count() if p.device.type == "cuda" else 1
+        if options.all_devices and there > 1 and len(p.mass) >= WORTH_DEVICES:
+            constants["devices"] = [f"cuda:{i}" for i in range(there)]
         if options.surface:
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(
                 torch.tensor([end - start for start, end in matter.ranges])
             )
             self._object = at_rows(which.to(p.device), rows)
-        self._constants: dict[str, Any] = constants
+        self._constants = constants
         self._rigid, self._matter, self._counters = rigid, matter, counters
         self._dt_scale = dt_scale
         self._start = self.time = state.time
