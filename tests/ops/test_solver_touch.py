@@ -32,12 +32,14 @@ def test_cube_rests_where_the_points_end(device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("cfl", "least"), [(0.25, 0.9), (0.5, 0.94)])
+@pytest.mark.parametrize(
+    ("cfl", "flip", "least"), [(0.25, 0.0, 0.9), (0.5, 0.0, 0.94), (0.25, 0.5, 0.94)]
+)
 def test_balls_bounce_and_make_neither_energy_nor_momentum(
-    cfl: float, least: float, device: str
+    cfl: float, flip: float, least: float, device: str
 ) -> None:
     with running_on(device):
-        kept, most, drift = touching.head_on(5.0, cfl=cfl)
+        kept, most, drift = touching.head_on(5.0, cfl=cfl, flip=flip)
     assert least < kept < 1.0  # the transfer's loss is one of each step
     assert most <= 1.0 + 1e-6
     assert drift < (1e-6 if device == "cpu" else 1e-5)  # sums of 32-bit numbers there

@@ -1,11 +1,10 @@
 // CUDA kernels of the collider operators: one thread per (point, collider), one per collider,
 // one per point.
 #include "cuda/collider/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
-
-constexpr int kThreads = 128;
 
 template <typename Args>
 __global__ void compute_kernel(Args a, int64_t count) {
@@ -16,8 +15,7 @@ __global__ void compute_kernel(Args a, int64_t count) {
 template <typename Args>
 cudaError_t compute(const Args& a, int64_t count, cudaStream_t stream) {
   if (count == 0) return cudaSuccess;
-  const unsigned blocks = static_cast<unsigned>((count + kThreads - 1) / kThreads);
-  compute_kernel<<<blocks, kThreads, 0, stream>>>(a, count);
+  compute_kernel<<<blocks_for<kFewThreads>(count), kFewThreads, 0, stream>>>(a, count);
   return cudaGetLastError();
 }
 

@@ -1,6 +1,7 @@
 // CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
 #include "core/deform/carry.h"
 #include "cuda/deform/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
@@ -36,9 +37,7 @@ __global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
 template <typename Args, typename Kernel>
 cudaError_t launch(const Args& args, cudaStream_t stream, Kernel kernel) {
   if (args.count == 0) return cudaSuccess;
-  constexpr int kThreads = 128;
-  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
-  kernel<<<blocks, kThreads, 0, stream>>>(args);
+  kernel<<<blocks_for<kFewThreads>(args.count), kFewThreads, 0, stream>>>(args);
   return cudaGetLastError();
 }
 

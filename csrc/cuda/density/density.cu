@@ -2,20 +2,15 @@
 // separable smoothing, one thread per cell or splat.
 #include "core/density.h"
 #include "cuda/density/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kThreads = 256;
-
-inline unsigned blocks_for(int64_t n) {
-  return static_cast<unsigned>((n + kThreads - 1) / kThreads);
-}
-
 // Whole numbers: the order in which threads come changes no bit.
 template <typename T>
 __global__ void scatter_kernel(DensityArgs<T> a, double per_weight) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t i = thread_number();
   DensityPlace<T> place;
   if (i >= a.count || !place.of(a.frame, a.nodes, a.means + 3 * i)) return;
   for (int corner = 0; corner < 8; ++corner)
@@ -26,7 +21,7 @@ __global__ void scatter_kernel(DensityArgs<T> a, double per_weight) {
 
 template <typename T>
 __global__ void occupied_kernel(DensityArgs<T> a, int64_t cells, double per_weight) {
-  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t k = thread_number();
   if (k >= cells) return;
   const int64_t units = a.units[k];
   if (units != 0) a.values[k] = T(double(units) / per_weight) * (T(1) / a.full);
@@ -35,7 +30,7 @@ __global__ void occupied_kernel(DensityArgs<T> a, int64_t cells, double per_weig
 // Cuts the finest level off at one and averages it into the next.
 template <typename T>
 __global__ void pool_kernel(T* fine, T* coarse, int side, bool cut) {
-  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t k = thread_number();
   if (k >= int64_t(side) * side * side) return;
   const int64_t x = k % side, y = k / side % side, z = k / side / side, twice = 2 * side;
   T sum = T(0);
@@ -50,7 +45,7 @@ __global__ void pool_kernel(T* fine, T* coarse, int side, bool cut) {
 
 template <typename T, int kPasses, int kAxis>
 __global__ void smooth_kernel(const T* in, T* out, int side) {
-  const int64_t k = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t k = thread_number();
   if (k >= int64_t(side) * side * side) return;
   const int at = kAxis == 0 ? static_cast<int>(k % side)
                             : static_cast<int>(kAxis == 1 ? k / side % side : k / side / side);
@@ -80,8 +75,7 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads) bulk_sums_kernel(BulkArgs<T> a) {
   double sum[kBulkSums] = {};
   const int64_t step = int64_t(gridDim.x) * kThreads;
-  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < a.count; i += step)
-    bulk_terms(a, i, sum);
+  for (int64_t i = thread_number(); i < a.count; i += step) bulk_terms(a, i, sum);
   // Every block leaves its share; they are added up in one order.
   __shared__ double warps[kThreads / 32][kBulkSums];
   for (int k = 0; k < kBulkSums; ++k) {
@@ -114,8 +108,7 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads) bulk_reach_kernel(BulkArgs<T> a) {
   double most = 0.0;
   const int64_t step = int64_t(gridDim.x) * kThreads;
-  for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < a.count; i += step)
-    most = max(most, bulk_away(a, i));
+  for (int64_t i = thread_number(); i < a.count; i += step) most = max(most, bulk_away(a, i));
   for (int offset = 16; offset > 0; offset /= 2)
     most = max(most, __shfl_xor_sync(0xffffffffu, most, offset));
   // Of numbers that are not negative, the bits are in the same order.
@@ -126,7 +119,7 @@ __global__ void __launch_bounds__(kThreads) bulk_reach_kernel(BulkArgs<T> a) {
 
 template <typename T>
 __global__ void normal_kernel(DensityNormalArgs<T> a) {
-  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t i = thread_number();
   if (i < a.count) density_normal(a, i);
 }
 

@@ -1,17 +1,11 @@
 // CUDA kernels of the ops on graphs: one thread for a link or a point.
 #include "cuda/graph/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kThreads = 256;
 constexpr int kSweeps = 4;  // between two looks of the host; one too many changes nothing
-
-inline unsigned blocks_for(int64_t n) {
-  return static_cast<unsigned>((n + kThreads - 1) / kThreads);
-}
-
-__device__ int64_t thread_number() { return int64_t(blockIdx.x) * kThreads + threadIdx.x; }
 
 __global__ void link_costs_kernel(LinkCostsArgs a) {
   const int64_t l = thread_number();

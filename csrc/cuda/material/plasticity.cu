@@ -3,13 +3,14 @@
 #include "core/material/more_laws.h"
 #include "core/material/stored_energy.h"
 #include "cuda/material/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
 // kMore: for laws of more_laws.h, too.
 template <typename T, bool kMore>
-__global__ void __launch_bounds__(128) return_mapping_kernel(const ReturnMappingArgs<T> a) {
+__global__ void __launch_bounds__(kFewThreads) return_mapping_kernel(const ReturnMappingArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   ReturnFlags f{false, false, false, false};
   if (i < a.count) {
@@ -32,7 +33,7 @@ __global__ void __launch_bounds__(128) return_mapping_kernel(const ReturnMapping
 }
 
 template <typename T>
-__global__ void __launch_bounds__(128) stored_energy_kernel(const StoredEnergyArgs<T> a) {
+__global__ void __launch_bounds__(kFewThreads) stored_energy_kernel(const StoredEnergyArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i < a.count) stored_energy_particle(a, i);
 }
@@ -42,12 +43,11 @@ __global__ void __launch_bounds__(128) stored_energy_kernel(const StoredEnergyAr
 template <typename T>
 cudaError_t return_mapping(const ReturnMappingArgs<T>& args, cudaStream_t stream) {
   if (args.count == 0) return cudaSuccess;
-  constexpr int kThreads = 128;
-  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
+  const unsigned blocks = blocks_for<kFewThreads>(args.count);
   if (args.apart)
-    return_mapping_kernel<T, true><<<blocks, kThreads, 0, stream>>>(args);
+    return_mapping_kernel<T, true><<<blocks, kFewThreads, 0, stream>>>(args);
   else
-    return_mapping_kernel<T, false><<<blocks, kThreads, 0, stream>>>(args);
+    return_mapping_kernel<T, false><<<blocks, kFewThreads, 0, stream>>>(args);
   return cudaGetLastError();
 }
 
@@ -57,9 +57,8 @@ template cudaError_t return_mapping(const ReturnMappingArgs<double>&, cudaStream
 template <typename T>
 cudaError_t neo_hookean_energy(const StoredEnergyArgs<T>& args, cudaStream_t stream) {
   if (args.count == 0) return cudaSuccess;
-  constexpr int kThreads = 128;
-  const unsigned blocks = static_cast<unsigned>((args.count + kThreads - 1) / kThreads);
-  stored_energy_kernel<T><<<blocks, kThreads, 0, stream>>>(args);
+  const unsigned blocks = blocks_for<kFewThreads>(args.count);
+  stored_energy_kernel<T><<<blocks, kFewThreads, 0, stream>>>(args);
   return cudaGetLastError();
 }
 

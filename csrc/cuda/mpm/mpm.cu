@@ -2,11 +2,11 @@
 // particles with the same base node inside the warp first, then adds one vector per node: the L2
 // rate of scattered reductions is the bound.
 #include "cuda/mpm/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kThreads = 128;
 constexpr unsigned kAll = 0xffffffffu;
 
 template <typename T>
@@ -64,8 +64,8 @@ __device__ void count_skipped(bool skipped, int64_t* total) {
 }
 
 template <typename T, bool kMoments>
-__global__ void __launch_bounds__(kThreads) p2g_kernel(P2GArgs<T> a) {
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+__global__ void __launch_bounds__(kFewThreads) p2g_kernel(P2GArgs<T> a) {
+  const int64_t r = thread_number<kFewThreads>();
   const bool exists = r < a.blocks.particles;
   int64_t p = exists ? a.blocks.order[r] : -1;
   const bool valid = p >= 0 && p < a.blocks.particles;
@@ -133,9 +133,9 @@ __device__ Gathered<T> gather(const T* grid, const StencilBlocks& at, const Sten
 }
 
 template <typename T, bool kAdjoint>
-__global__ void __launch_bounds__(kThreads) gather_kernel(GatherArgs<T> a) {
+__global__ void __launch_bounds__(kFewThreads) gather_kernel(GatherArgs<T> a) {
   constexpr int kChannels = kAdjoint ? 4 : 3;
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t r = thread_number<kFewThreads>();
   const bool exists = r < a.blocks.particles;
   const int64_t p = exists ? a.blocks.order[r] : -1;
   const bool valid = p >= 0 && p < a.blocks.particles;
@@ -173,14 +173,14 @@ __device__ double warp_sum(double v) {
 // Sums kColumns numbers over the CTA into `out`, in a fixed order.
 template <int kColumns>
 __device__ void sum_cta(double (&value)[kColumns], double* out) {
-  __shared__ double sums[kThreads / 32][kColumns];
+  __shared__ double sums[kFewThreads / 32][kColumns];
   for (int i = 0; i < kColumns; ++i) value[i] = warp_sum(value[i]);
   if ((threadIdx.x & 31) == 0)
     for (int i = 0; i < kColumns; ++i) sums[threadIdx.x / 32][i] = value[i];
   __syncthreads();
   if (threadIdx.x < kColumns) {
     double s = 0.0;
-    for (int w = 0; w < kThreads / 32; ++w) s += sums[w][threadIdx.x];
+    for (int w = 0; w < kFewThreads / 32; ++w) s += sums[w][threadIdx.x];
     out[threadIdx.x] = s;
   }
   __syncthreads();
@@ -199,10 +199,10 @@ struct Chunk {
 
 // Velocities and contact between fields, then the mass that each collider with mass touches.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_velocity_kernel(GridUpdateArgs<T> a) {
+__global__ void __launch_bounds__(kFewThreads) grid_velocity_kernel(GridUpdateArgs<T> a) {
   const Chunk chunk(a.count);
   unsigned touched = 0;
-  for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
+  for (int64_t node = chunk.first; node < chunk.last; node += kFewThreads)
     touched += update_node(a, node) ? 1u : 0u;
   if (a.moments != nullptr) {
     touched = __reduce_add_sync(kAll, touched);
@@ -214,7 +214,7 @@ __global__ void __launch_bounds__(kThreads) grid_velocity_kernel(GridUpdateArgs<
     const T* row = a.colliders + c * kColliderColumns;
     double mass[1] = {0.0};
     if (row[kMass] > T(0) && collider_valid(row, a.sdf_count))
-      for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
+      for (int64_t node = chunk.first; node < chunk.last; node += kFewThreads)
         mass[0] += touching_mass(a, row, node);
     sum_cta(mass, a.partial + int64_t(blockIdx.x) * a.collider_count + c);
   }
@@ -222,14 +222,14 @@ __global__ void __launch_bounds__(kThreads) grid_velocity_kernel(GridUpdateArgs<
 
 // Every collider in row order, with an ordered partial sum of its impulse and torque.
 template <typename T>
-__global__ void __launch_bounds__(kThreads) grid_collide_kernel(GridUpdateArgs<T> a) {
+__global__ void __launch_bounds__(kFewThreads) grid_collide_kernel(GridUpdateArgs<T> a) {
   const Chunk chunk(a.count);
   for (int64_t c = 0; c < a.collider_count; ++c) {
     const T* row = a.colliders + c * kColliderColumns;
     double sums[6] = {};
     if (collider_valid(row, a.sdf_count)) {
       const T give = collider_give(row, static_cast<T>(a.contact_mass[c]));
-      for (int64_t node = chunk.first; node < chunk.last; node += kThreads)
+      for (int64_t node = chunk.first; node < chunk.last; node += kFewThreads)
         collide_node(a, row, give, node, sums);
     } else {
       // A row that is no collider must not be ignored quietly.
@@ -250,31 +250,32 @@ __global__ void sum_chunks_kernel(const double* partial, int64_t chunks, int64_t
   if (threadIdx.x == 0) sums[column] = s;
 }
 
-int64_t ctas(int64_t n) { return (n + kThreads - 1) / kThreads; }
-
 }  // namespace
 
 template <typename T>
 cudaError_t p2g(const P2GArgs<T>& a, cudaStream_t stream) {
   if (a.blocks.particles == 0) return cudaSuccess;
   if (a.moments != nullptr)
-    p2g_kernel<T, true><<<ctas(a.blocks.particles), kThreads, 0, stream>>>(a);
+    p2g_kernel<T, true><<<blocks_for<kFewThreads>(a.blocks.particles), kFewThreads, 0, stream>>>(a);
   else
-    p2g_kernel<T, false><<<ctas(a.blocks.particles), kThreads, 0, stream>>>(a);
+    p2g_kernel<T, false>
+        <<<blocks_for<kFewThreads>(a.blocks.particles), kFewThreads, 0, stream>>>(a);
   return cudaGetLastError();
 }
 
 template <typename T>
 cudaError_t g2p(const GatherArgs<T>& a, cudaStream_t stream) {
   if (a.blocks.particles == 0) return cudaSuccess;
-  gather_kernel<T, false><<<ctas(a.blocks.particles), kThreads, 0, stream>>>(a);
+  gather_kernel<T, false>
+      <<<blocks_for<kFewThreads>(a.blocks.particles), kFewThreads, 0, stream>>>(a);
   return cudaGetLastError();
 }
 
 template <typename T>
 cudaError_t p2g_adjoint(const GatherArgs<T>& a, cudaStream_t stream) {
   if (a.blocks.particles == 0) return cudaSuccess;
-  gather_kernel<T, true><<<ctas(a.blocks.particles), kThreads, 0, stream>>>(a);
+  gather_kernel<T, true>
+      <<<blocks_for<kFewThreads>(a.blocks.particles), kFewThreads, 0, stream>>>(a);
   return cudaGetLastError();
 }
 
@@ -282,10 +283,10 @@ template <typename T>
 cudaError_t grid_update(const GridUpdateArgs<T>& a, cudaStream_t stream) {
   const int64_t chunks = grid_update_chunks(a.count), rows = a.collider_count;
   if (chunks == 0) return cudaSuccess;
-  grid_velocity_kernel<T><<<chunks, kThreads, 0, stream>>>(a);
+  grid_velocity_kernel<T><<<chunks, kFewThreads, 0, stream>>>(a);
   if (rows > 0) {
     sum_chunks_kernel<<<rows, 32, 0, stream>>>(a.partial, chunks, rows, a.contact_mass);
-    grid_collide_kernel<T><<<chunks, kThreads, 0, stream>>>(a);
+    grid_collide_kernel<T><<<chunks, kFewThreads, 0, stream>>>(a);
     sum_chunks_kernel<<<6 * rows, 32, 0, stream>>>(a.partial, chunks, 6 * rows, a.impulse);
   }
   return cudaGetLastError();

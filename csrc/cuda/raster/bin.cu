@@ -8,16 +8,14 @@
 
 #include "cuda/raster/launch.h"
 #include "cuda/raster/layout.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kThreads = 256;
 constexpr unsigned kAllLanes = 0xffffffffu;
 constexpr uint32_t kStaged = 512;      // list entries that a warp gathers before it writes them
 constexpr int64_t kShortKeys = 65536;  // as many values fit 16 bits
-
-int blocks_for(int64_t n) { return static_cast<int>((n + kThreads - 1) / kThreads); }
 
 size_t aligned(size_t bytes) { return (bytes + 255) / 256 * 256; }
 
@@ -44,7 +42,7 @@ using RankCounts = thrust::transform_iterator<CountOfRank, thrust::counting_iter
 template <typename T, typename Key>
 __global__ void __launch_bounds__(kThreads)
     emit_kernel(RasterArgs<T> a, RasterOrder o, Key* tiles, int32_t* ids) {
-  const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int64_t r = thread_number();
   const int lane = threadIdx.x % 32;
   const bool real = r < a.splat_count();
   const int32_t id = real ? o.order[r] : 0;

@@ -1,16 +1,9 @@
 // CUDA kernels of the spatial ops: one thread for a point or a voxel.
 #include "cuda/spatial/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
-
-constexpr int kThreads = 256;
-
-inline unsigned blocks_for(int64_t n) {
-  return static_cast<unsigned>((n + kThreads - 1) / kThreads);
-}
-
-__device__ int64_t thread_number() { return int64_t(blockIdx.x) * kThreads + threadIdx.x; }
 
 __global__ void clear_kernel(NearestLabelsArgs a) {
   const int64_t k = thread_number();

@@ -79,14 +79,16 @@ def watched(
     return sum(seen) / len(seen), f"mean of 200 s, swing {max(seen) - min(seen):.3f}"
 
 
-def bounced(radius: float, bar: float, kept: float, most: float, note: str) -> Iterator[Result]:
+def bounced(
+    radius: float, bar: float, kept: float, most: float, note: str, steps: str = ""
+) -> Iterator[Result]:
     """What an elastic ball of this radius [dx] keeps, within a bar, and its largest energy."""
     yield compare(
-        f"restitution, R = {radius:g} dx", kept, 1.0, tolerance=bar, source="elastic impact",
+        f"restitution, R = {radius:g} dx{steps}", kept, 1.0, tolerance=bar, source="elastic impact",
         note=f"{note}; damping of the transfer (docs/theory/mpm.md)",
     )  # fmt: skip
     yield compare(
-        f"largest energy / first, R = {radius:g} dx", most, 1.0, tolerance=1e-5,
+        f"largest energy / first, R = {radius:g} dx{steps}", most, 1.0, tolerance=1e-5,
         source="energy never rises",
     )  # fmt: skip
 

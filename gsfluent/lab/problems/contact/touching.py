@@ -23,7 +23,12 @@ REST = torch.zeros(3, dtype=torch.float64)
 
 
 def head_on(
-    radius: float, speed: float = 0.05, *, touch: bool = True, cfl: float = 0.5
+    radius: float,
+    speed: float = 0.05,
+    *,
+    touch: bool = True,
+    cfl: float = 0.5,
+    flip: float = 0.0,
 ) -> tuple[float, float, float]:
     """Let two elastic balls meet head-on.
 
@@ -32,6 +37,7 @@ def head_on(
         speed: Of each [c].
         touch: Whether points push each other; else nodes exchange impulses.
         cfl: Courant number.
+        flip: Share of their own motion that points keep.
 
     Returns:
         Speed kept, largest energy over that at the start, and the momentum that appeared over that
@@ -43,7 +49,7 @@ def head_on(
     along = torch.tensor([speed, 0.0, 0.0], dtype=torch.float64)
     world = bodies(
         [points - place + shift, points + place + shift], [along, -along],
-        volume=torch.cat([volume, volume]), dtype=torch.float32, cfl=cfl,
+        volume=torch.cat([volume, volume]), dtype=torch.float32, cfl=cfl, flip=flip,
         surface=HALF if touch else None, touch=touch,
     )  # fmt: skip
     first = torch.arange(len(world.position)) < len(points)
@@ -113,6 +119,16 @@ def balls_head_on() -> Iterator[Result]:
         yield compare(
             f"momentum, R = {radius:g} dx", drift, tolerance=1e-6, source="conservation",
         )  # fmt: skip
+
+
+@problem(tier="slow")
+def balls_head_on_short() -> Iterator[Result]:
+    """The same by shorter steps, points keeping what these would lose."""
+    for cfl in (0.25, 0.125):
+        for radius, bar in ((6.0, 0.05), (10.0, 0.03)):
+            kept, most, _ = head_on(radius, cfl=cfl, flip=1.0 - 2.0 * cfl)
+            note = f"0.05 c each; points push; keep {1.0 - 2.0 * cfl:g} of their own motion"
+            yield from bounced(radius, bar, kept, most, note, f", CFL {cfl:g}")
 
 
 @problem(tier="fast")
