@@ -158,20 +158,6 @@ def test_the_same_failure_at_the_same_step() -> None:
     assert told[0] == told[1]
 
 
-@pytest.mark.parametrize(
-    "named, why",
-    [
-        (["cuda:0", "cuda:99"], "cuda:99 is not there; this machine has"),
-        (["cpu"], "must be CUDA devices"),
-        (["moon"], "'moon' is no device"),
-        ([], "devices is empty"),
-    ],
-)
-def test_devices_that_are_none_are_refused(named: list[str], why: str) -> None:
-    with pytest.raises(InputError, match=why):
-        ops.Solver(**here(small("elastic", torch.float32)), devices=named)
-
-
 def test_points_must_lie_on_one_of_the_devices() -> None:
     with pytest.raises(InputError, match="the points lie on cuda:0"):
         ops.Solver(**here(small("elastic", torch.float32)), devices=devices()[1:])
