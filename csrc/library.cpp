@@ -46,8 +46,11 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
   m.def("solver_ranks(Tensor[] buffers, int[] ints, float[] floats) -> Tensor");
   m.def(
-      "solver_move_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
-      "bool back) -> ()");
+      "solver_prime_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
+      "bool load) -> ()");
+  m.def(
+      "solver_gather_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats) "
+      "-> ()");
   m.def(
       "solver_run_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
       "int rounds, int steps) -> ()");

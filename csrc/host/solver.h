@@ -326,11 +326,18 @@ struct SolverOps {
   }
 
   // Several ranks on CUDA: `parts` holds the buffers of each, one after the other, and `buffers`
-  // those of all. Points go to the ranks, or back.
-  static void solver_move_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
-                                std::vector<double> floats, bool back) {
+  // those of all. As solver_prime; before that the points go to the ranks, if they should.
+  static void solver_prime_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
+                                 std::vector<double> floats, bool load) {
     call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
-      Backend::move_ranks(std::move(views), like, back);
+      Backend::prime_ranks(std::move(views), like, law_set(ints), load);
+    });
+  }
+  // The points go back to the buffers of all.
+  static void solver_gather_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
+                                  std::vector<double> floats) {
+    call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
+      Backend::gather_ranks(std::move(views), like);
     });
   }
   // As solver_run.
@@ -348,7 +355,8 @@ struct SolverOps {
     if constexpr (Backend::kHasRanks) {
       GSF_IMPL(SolverOps, solver_ranks);
     } else {
-      GSF_IMPL(SolverOps, solver_move_ranks);
+      GSF_IMPL(SolverOps, solver_prime_ranks);
+      GSF_IMPL(SolverOps, solver_gather_ranks);
       GSF_IMPL(SolverOps, solver_run_ranks);
     }
   }

@@ -275,7 +275,7 @@ class Solver(SolverState):
             b.radius = radius.contiguous()
             if self.device.type == "cuda":  # on a CPU the kernels have them
                 b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
-        self._buffers = b
+        self._whole, self._parts = b, None
         self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
         if bool(self.frame.any()):
             velocity = (velocity.double() - self.frame).to(velocity)
@@ -320,8 +320,8 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
-        several = self.ranks > 1 and self.device.type == "cuda"
-        self._parts = Parts(b, self.devices, self.fields) if several else None
+        if self.ranks > 1 and self.device.type == "cuda":
+            self._parts = Parts(b, self.devices, self.fields, *self._settings())
 
     def _per_field(self, name: str, given: Tensor | None) -> Tensor:
         """A whole number of each field, checked, where the state is."""
@@ -425,16 +425,16 @@ class Solver(SolverState):
             ValueError: Another number of rows, or rows that are no collider.
         """
         _no_restitution("Solver.set_colliders", 0.0, colliders)
-        rows, have = pad_colliders(colliders), self._buffers.colliders
+        rows, have = pad_colliders(colliders), self._whole.colliders
         if rows.shape != have.shape:
             raise ValueError(
                 f"Solver.set_colliders: colliders must have shape {list(have.shape)}, "
                 f"got {list(rows.shape)}"
             )
         if rows.numel():
-            check_colliders("Solver.set_colliders", rows, self._buffers.sdf.shape[0])
+            check_colliders("Solver.set_colliders", rows, self._whole.sdf.shape[0])
             have.copy_(rows)
-            self._buffers.collider_state.copy_(rows)
+            self._whole.collider_state.copy_(rows)
 
     def advance(self, until: float | None = None, *, steps: int | None = None) -> None:
         """Advance to a time, by a number of steps, or to whichever comes first.
@@ -469,35 +469,24 @@ class Solver(SolverState):
         self._write(until=goal, steps_left=left, done=0, reason=0, lost=0, leaving=0, rebuild=1)
         ints, floats = self._settings()
         with torch.no_grad():
-            torch.ops.gsfluent.solver_prime(self._buffers.listed(), ints, floats)
-            parts = self._parts
-            if parts is not None:
-                parts.begin()
-                self._move_ranks(parts, back=False)
+            if self._parts is None:
+                torch.ops.gsfluent.solver_prime(self._whole.listed(), ints, floats)
+            else:
+                self._parts.prime()
             while True:
                 now = self.clock()
-                if now["done"] or now["reason"]:
-                    if parts is not None:
-                        self._move_ranks(parts, back=True)
-                    if not now["reason"]:
-                        return
+                if now["reason"]:
                     self._write(done=1, rebuild=1)
                     raise SolverError(int(now["reason"]), now["time"], int(now["step"]))
+                if now["done"]:
+                    return
                 if now["grow"]:
                     self._grow(now)
                 rounds, steps = self._rounds(now), self.steps_per_round
-                listed = self._buffers.listed()
-                if parts is None:
-                    torch.ops.gsfluent.solver_run(listed, ints, floats, rounds, steps)
+                if self._parts is None:
+                    torch.ops.gsfluent.solver_run(self._whole.listed(), ints, floats, rounds, steps)
                 else:
-                    torch.ops.gsfluent.solver_run_ranks(
-                        listed, parts.listed(), ints, floats, rounds, steps
-                    )
-
-    def _move_ranks(self, parts: Parts, *, back: bool) -> None:
-        """The points of all to the ranks, or back."""
-        listed, of_ranks = self._buffers.listed(), parts.listed()
-        torch.ops.gsfluent.solver_move_ranks(listed, of_ranks, *self._settings(), back)
+                    self._parts.run(rounds, steps)
 
     steps_per_round = 8
     """Steps between two chances to build blocks on a GPU."""
@@ -513,7 +502,7 @@ class Solver(SolverState):
 
     def _grow(self, now: dict[str, float]) -> None:
         """Make room for more blocks; every present value is kept."""
-        b = self._buffers
+        b = self._whole
         homes = max(int(1.5 * now["wanted_homes"]) + 64, b.home_start0.shape[0])
         slots = max(int(1.5 * now["wanted_slots"]) + 64, b.slot_next.shape[0])
         b.reserve_blocks(homes, slots, self.fields)
@@ -556,7 +545,9 @@ class Solver(SolverState):
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Go back to a :meth:`snapshot` of this solver."""
-        b = self._buffers
+        b = self._whole
+        if self._parts is not None:
+            self._parts.away = False
         for name, value in saved.items():
             target = getattr(b, name)
             if target.shape == value.shape:

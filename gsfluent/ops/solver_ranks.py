@@ -23,7 +23,7 @@ MAIL_WORDS = 11
 
 _POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
            "place", "viscous", "own")  # fmt: skip
-_MOVING = ("colliders", "collider_state", "impulse", "spring_rows")
+_MOVING = ("colliders", "collider_state", "impulse")
 _STATIC = ("law", "rows", "sdf", "parent", "cut", "radius", "object")
 
 
@@ -83,10 +83,18 @@ class Parts:
         whole: Buffers of all, which get what only ranks need.
         devices: Device of each rank.
         fields: Velocity fields.
+        ints, floats: Settings of the operators.
+
+    Attributes:
+        away: Whether the points lie with the ranks and not in the buffers of all.
     """
 
-    def __init__(self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int) -> None:
+    def __init__(
+        self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int,
+        ints: list[int], floats: list[float],
+    ) -> None:  # fmt: skip
         self.whole, self.devices, self.fields = whole, tuple(devices), fields
+        self._settings, self.away = (ints, floats), False
         self._equip(whole)
         self.parts = [self._part(device) for device in devices]
 
@@ -106,7 +114,7 @@ class Parts:
             value = getattr(whole, field.name)
             if field.name in _STATIC:
                 new = value.to(device)
-            elif field.name in (*_POINTS, *_MOVING, "clock", "impulse_units"):
+            elif field.name in (*_POINTS, *_MOVING, "clock", "impulse_units", "spring_rows"):
                 new = torch.zeros_like(value, device=device)
             else:
                 new = value.new_zeros((0, *value.shape[1:]), device=device)
@@ -116,16 +124,29 @@ class Parts:
         self._equip(part)
         return part
 
-    def listed(self) -> list[Tensor]:
-        """The buffers of one rank after the other."""
-        return [tensor for part in self.parts for tensor in part.listed()]
+    def _lists(self) -> tuple[list[Tensor], list[Tensor], list[int], list[float]]:
+        """What the operators take: buffers of all, of one rank after the other, settings."""
+        parts = [tensor for part in self.parts for tensor in part.listed()]
+        return self.whole.listed(), parts, *self._settings
 
-    def begin(self) -> None:
-        """Tell the ranks what may have changed since the last call."""
+    def prime(self) -> None:
+        """Begin a call: as ``solver_prime``, with what may have changed since the last one."""
         for part in self.parts:
             for name in _MOVING:
                 getattr(part, name).copy_(getattr(self.whole, name))
             part.impulse_units.zero_()
+        torch.ops.gsfluent.solver_prime_ranks(*self._lists(), not self.away)
+        self.away = True
+
+    def run(self, rounds: int, steps: int) -> None:
+        """As ``solver_run``."""
+        torch.ops.gsfluent.solver_run_ranks(*self._lists(), rounds, steps)
+
+    def gather(self) -> None:
+        """Bring the points back, if they are away."""
+        if self.away:
+            torch.ops.gsfluent.solver_gather_ranks(*self._lists())
+            self.away = False
 
     def grow(self, homes: int, slots: int) -> None:
         """Make room for more blocks on every rank; ``whole`` has it already."""

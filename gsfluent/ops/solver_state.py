@@ -52,13 +52,21 @@ class SolverState:
     implicit: bool
     k: float
     epsilon: float
-    _buffers: layout.Buffers
+    _whole: layout.Buffers
+    """Every tensor; of several ranks on CUDA without the points, while they are away."""
     _params: Tensor
     _law: Tensor
     _unused: dict[str, Tensor]
     """alpha and peak where no law uses them, as given."""
     _law_set: int
     _parts: Parts | None
+
+    @property
+    def _buffers(self) -> layout.Buffers:
+        """Every tensor, with the points in them."""
+        if self._parts is not None:
+            self._parts.gather()
+        return self._whole
 
     # --- loading ---
 
@@ -194,18 +202,18 @@ class SolverState:
     # --- the clock ---
 
     def _write(self, **values: float) -> None:
-        clock = self._buffers.clock.cpu()
+        clock = self._whole.clock.cpu()
         real = clock.view(torch.float64)
         for name, value in values.items():
             if name in layout.FLOATS:
                 real[INDEX[name]] = value
             else:
                 clock[INDEX[name]] = int(value)
-        self._buffers.clock.copy_(clock)
+        self._whole.clock.copy_(clock)
 
     def clock(self) -> dict[str, float]:
         """Return every member of the clock; waits for the device."""
-        clock = self._buffers.clock.cpu()
+        clock = self._whole.clock.cpu()
         whole, real = clock.tolist(), clock.view(torch.float64).tolist()
         return {
             name: real[i] if name in layout.FLOATS else whole[i]
@@ -240,7 +248,7 @@ class SolverState:
 
     def memory(self) -> int:
         """Return the bytes of every tensor of the solver."""
-        return self._buffers.memory() + (self._parts.memory() if self._parts else 0)
+        return self._whole.memory() + (self._parts.memory() if self._parts else 0)
 
     # --- reading ---
 
@@ -395,17 +403,17 @@ class SolverState:
     @property
     def impulse(self) -> Tensor:
         """Impulse given to the matter by each collider since the start [N s], float64 [K, 3]."""
-        return self._buffers.impulse[:, :3].clone()
+        return self._whole.impulse[:, :3].clone()
 
     @property
     def torque(self) -> Tensor:
         """Angular impulse on the matter by each collider about its point [N m s], [K, 3]."""
-        return self._buffers.impulse[:, 3:6].clone()
+        return self._whole.impulse[:, 3:6].clone()
 
     @property
     def colliders(self) -> Tensor:
         """The colliders where they are now, float64 [K, columns]."""
-        return self._buffers.collider_state.clone()
+        return self._whole.collider_state.clone()
 
     def counters(self) -> dict[str, float]:
         """Return what was done: steps, builds, blocks, plastic, guarded and inverted points, ..."""

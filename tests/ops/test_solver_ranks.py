@@ -289,6 +289,20 @@ def test_a_number_of_ranks_that_is_none_is_refused(ranks: Any) -> None:
         ops.Solver(**small("elastic"), ranks=ranks)
 
 
+@pytest.mark.parametrize(
+    "named, why",
+    [
+        (["cpu", "cpu"], "devices must be CUDA devices, got cpu"),
+        (["moon"], "'moon' is no device"),
+        ([], "devices is empty"),
+        (["cuda:99"], "cuda:99 is not there; this machine has"),
+    ],
+)
+def test_devices_that_are_none_are_refused(named: list[str], why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        ops.Solver(**small("elastic"), devices=named)
+
+
 def test_what_ranks_do_not_know_is_refused_by_name() -> None:
     row = parameters(1e5, 0.3, 1.0, c2=1.0, c3=0.04, c4=0.02, c5=PHASE_CODES[0])
     given = of_law(9, row)(torch.float32)

@@ -133,6 +133,21 @@ def test_a_time_is_met_in_one_call_or_in_two() -> None:
         assert_equal(several, one)
 
 
+def test_points_stay_with_their_ranks_until_somebody_looks() -> None:
+    given = here(CASES["bullet"](torch.float32))
+    one, several = ops.Solver(**given), ops.Solver(**given, ranks=3)
+    for solver in (one, several):
+        solver.advance(steps=15)
+        solver.advance(steps=1)
+        slower = solver.colliders
+        slower[:, 10:13] *= 0.5
+        solver.set_colliders(slower)
+        solver.advance(steps=10)
+    assert several._parts.away
+    assert_equal(several, one)
+    assert not several._parts.away
+
+
 def test_the_same_failure_at_the_same_step() -> None:
     given = here(small("two bodies", torch.float32))
     told = []
@@ -141,20 +156,6 @@ def test_the_same_failure_at_the_same_step() -> None:
             run(given, ranks=ranks, dt=6e-3)
         told.append(str(failure.value))
     assert told[0] == told[1]
-
-
-@pytest.mark.parametrize(
-    "named, why",
-    [
-        (["cuda:0", "cuda:99"], "cuda:99 is not there; this machine has"),
-        (["cpu"], "must be CUDA devices"),
-        (["moon"], "'moon' is no device"),
-        ([], "devices is empty"),
-    ],
-)
-def test_devices_that_are_none_are_refused(named: list[str], why: str) -> None:
-    with pytest.raises(InputError, match=why):
-        ops.Solver(**here(small("elastic", torch.float32)), devices=named)
 
 
 def test_points_must_lie_on_one_of_the_devices() -> None:

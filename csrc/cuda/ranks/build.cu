@@ -104,19 +104,28 @@ __global__ void __launch_bounds__(kCutThreads)
     s.home_rank[h] = static_cast<int32_t>(int64_t(filled[bin(h)]) * s.ranks / s.count);
 }
 
-// A rank hears how the build went and has no homes yet; or (no build) the clock of all.
+// A rank hears how the build went and has no homes yet; or the clock of all, and keeps its homes.
 template <typename T>
 __global__ void hear_kernel(const __grid_constant__ SolverView<T> s,
                             const __grid_constant__ SolverView<T> all, bool build) {
   SolverClock& c = *s.clock;
-  if (build && !may_build(c)) return;
   if (!build) {
-    c = *all.clock;
-    c.homes = c.slots = c.sites = c.plastic = c.guarded = c.inverted = c.invalid = 0;
+    SolverClock now = *all.clock;
+    now.homes = c.homes;
+    now.slots = c.slots;
+    now.cursor = c.cursor;
+    now.plastic = now.guarded = now.inverted = now.invalid = 0;
+    c = now;
+    return;
   }
+  if (!may_build(c)) return;
   c.grow = all.clock->grow;
   c.reason = all.clock->reason;
   c.wanted_homes = c.wanted_slots = c.cursor = c.shared_sites = c.shared_homes = 0;
+}
+template <typename T>
+__global__ void empty_kernel(const __grid_constant__ SolverView<T> s) {
+  s.clock->wanted_homes = s.clock->cursor = s.clock->slots = 0;
 }
 
 // The homes that a rank owns.
@@ -281,20 +290,39 @@ __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ 
 }  // namespace
 
 template <typename T>
-cudaError_t ranks_load(const Fleet<T>& fleet) {
+cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set, bool load) {
   const SolverView<T>& all = fleet.all();
   const unsigned homes = static_cast<unsigned>(all.home_capacity);
-  fleet.of_all([&](const SolverView<T>& s, cudaStream_t stream) {
-    cut_kernel<T><<<1, kCutThreads, 0, stream>>>(s, false);
-  });
-  cudaError_t error = fleet.meet();
+  cudaError_t error = cudaSuccess;
+  const auto meet = [&] {
+    const cudaError_t met = fleet.meet();
+    if (error == cudaSuccess) error = met;
+  };
+  if (load)
+    fleet.of_all([&](const SolverView<T>& s, cudaStream_t stream) {
+      cut_kernel<T><<<1, kCutThreads, 0, stream>>>(s, false);
+    });
+  meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
     hear_kernel<T><<<1, 1, 0, stream>>>(s, all, false);
+    if (!load) return;
+    empty_kernel<T><<<1, 1, 0, stream>>>(s);
     take_kernel<T><<<ctas(homes), kThreads, 0, stream>>>(s, all, false);
     loaded_kernel<T><<<1, 1, 0, stream>>>(s);
     fetch_kernel<T, false><<<homes, kThreads, 0, stream>>>(s, all);
   });
-  if (error == cudaSuccess) error = fleet.meet();
+  for (const bool measure : {true, false}) {
+    fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
+      solver_prime_points(s, law_set, measure, stream);
+    });
+    meet();
+    const auto start = [&](const SolverView<T>& s, cudaStream_t stream) {
+      solver_start(s, measure, stream);
+    };
+    fleet.each(start);
+    fleet.of_all(start);
+    meet();
+  }
   return error == cudaSuccess ? cudaGetLastError() : error;
 }
 
@@ -418,10 +446,10 @@ cudaError_t ranks_step(const Fleet<T>& fleet, int law_set) {
   return error == cudaSuccess ? cudaGetLastError() : error;
 }
 
-#define GSF_INSTANTIATE(T)                               \
-  template cudaError_t ranks_load<T>(const Fleet<T>&);   \
-  template cudaError_t ranks_gather<T>(const Fleet<T>&); \
-  template cudaError_t ranks_build<T>(const Fleet<T>&);  \
+#define GSF_INSTANTIATE(T)                                         \
+  template cudaError_t ranks_prime<T>(const Fleet<T>&, int, bool); \
+  template cudaError_t ranks_gather<T>(const Fleet<T>&);           \
+  template cudaError_t ranks_build<T>(const Fleet<T>&);            \
   template cudaError_t ranks_step<T>(const Fleet<T>&, int);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

@@ -67,9 +67,11 @@ struct Fleet {
   }
 };
 
-// Points of all to the ranks, which then know their homes and the clock; and back.
+// Starts the clocks as that of all says, and takes the stress of the first step into the slopes;
+// before that (load) the points of all go to the ranks.
 template <typename T>
-cudaError_t ranks_load(const Fleet<T>& fleet);
+cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set, bool load);
+// The points go back.
 template <typename T>
 cudaError_t ranks_gather(const Fleet<T>& fleet);
 // Builds blocks when the clock asks for them, and cuts anew.

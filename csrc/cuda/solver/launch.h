@@ -19,9 +19,14 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
 template <typename T>
 cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream);
 
-// Parts of these, between which several ranks wait for each other (cuda/ranks/ranks.h): points to
-// nodes, without and with what acts on them; nodes, and nodes to points. One rank's step ends with
-// that; what several told makes its end.
+// Parts of these, between which several ranks wait for each other (cuda/ranks/ranks.h). Before the
+// first step: its speeds, then its stress, and the clock of each. In a step: points to nodes,
+// without and with what acts on them; nodes, and nodes to points. One rank's step ends with that;
+// what several told makes its end.
+template <typename T>
+void solver_prime_points(const SolverView<T>& s, int law_set, bool measure, cudaStream_t stream);
+template <typename T>
+void solver_start(const SolverView<T>& s, bool measure, cudaStream_t stream);
 template <typename T>
 void solver_free_to_nodes(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>

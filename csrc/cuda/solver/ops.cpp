@@ -140,11 +140,15 @@ struct SolverCuda {
   using Scope = CudaScope;
   static constexpr bool kHasRanks = false;
   template <typename T>
-  static void move_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,
-                         bool back) {
+  static void prime_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,
+                          int law_set, bool load) {
     const Ranks<T> ranks(std::move(views), like);
-    check_cuda("solver_move_ranks",
-               back ? cuda::ranks_gather(ranks.fleet()) : cuda::ranks_load(ranks.fleet()));
+    check_cuda("solver_prime_ranks", cuda::ranks_prime(ranks.fleet(), law_set, load));
+  }
+  template <typename T>
+  static void gather_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like) {
+    const Ranks<T> ranks(std::move(views), like);
+    check_cuda("solver_gather_ranks", cuda::ranks_gather(ranks.fleet()));
   }
   template <typename T>
   static void run_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,

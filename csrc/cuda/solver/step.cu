@@ -5,6 +5,14 @@ namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
+// Once the largest values of all points are known.
+template <typename T>
+__device__ void start(const SolverView<T>& s, bool measure) {
+  if (measure)
+    start_clock(*s.clock, double(s.dx));
+  else
+    choose_unit(*s.clock);
+}
 template <typename T, int kLaws>
 __global__ void __launch_bounds__(kThreads)
     prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
@@ -27,10 +35,7 @@ __global__ void __launch_bounds__(kThreads)
   if (!end.leave(values, bits)) return;
   hand_over(s, bits, measure ? -1 : int64_t(blockIdx.x), measure);
   if (!last_to_arrive(&s.clock->arrived, home_total) || (threadIdx.x & 31) != 0) return;
-  if (measure)
-    start_clock(*s.clock, double(s.dx));
-  else
-    choose_unit(*s.clock);
+  if (s.peers == nullptr) start(s, measure);
 }
 
 // Of several ranks: the maxima and sums of all are this one's, and the step ends. One warp.
@@ -73,6 +78,23 @@ __global__ void end_kernel(const __grid_constant__ SolverView<T> s) {
   end_of_step(s);
 }
 
+// The same for the largest values before the first step.
+template <typename T>
+__global__ void tell_start_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& c = *s.clock;
+  const uint64_t largest[] = {c.speed, c.wave, c.gradient, c.bound};
+  for (int i = kMailSpeed; i <= kMailBound; ++i) s.mail[i] = static_cast<int64_t>(largest[i]);
+}
+template <typename T>
+__global__ void start_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
+  SolverClock& c = *s.clock;
+  uint64_t* largest[] = {&c.speed, &c.wave, &c.gradient, &c.bound};
+  for (int i = kMailSpeed; i <= kMailBound; ++i)
+    for (int q = 0; q < s.ranks; ++q)
+      *largest[i] = max(*largest[i], static_cast<uint64_t>(s.peers[q].mail[i]));
+  start(s, measure);
+}
+
 // A rank tells what its step was like.
 template <typename T>
 __global__ void tell_kernel(const __grid_constant__ SolverView<T> s) {
@@ -98,16 +120,26 @@ __global__ void tell_kernel(const __grid_constant__ SolverView<T> s) {
 }  // namespace
 
 template <typename T>
-cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream) {
+void solver_prime_points(const SolverView<T>& s, int law_set, bool measure, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
-  if (s.radius != nullptr) solver_spring_rows(s, stream);
-  for (const bool measure : {true, false})
-    if (with_springs(law_set))
-      prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
-    else if (law_set == kMoreLaws)
-      prime_kernel<T, kMoreLaws><<<homes, kThreads, 0, stream>>>(s, measure);
-    else
-      prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
+  if (measure && s.radius != nullptr) solver_spring_rows(s, stream);
+  if (with_springs(law_set))
+    prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
+  else if (law_set == kMoreLaws)
+    prime_kernel<T, kMoreLaws><<<homes, kThreads, 0, stream>>>(s, measure);
+  else
+    prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
+  if (s.peers != nullptr) tell_start_kernel<T><<<1, 1, 0, stream>>>(s);
+}
+
+template <typename T>
+void solver_start(const SolverView<T>& s, bool measure, cudaStream_t stream) {
+  start_kernel<T><<<1, 1, 0, stream>>>(s, measure);
+}
+
+template <typename T>
+cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t stream) {
+  for (const bool measure : {true, false}) solver_prime_points(s, law_set, measure, stream);
   return cudaGetLastError();
 }
 
@@ -160,11 +192,13 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   return cudaGetLastError();
 }
 
-#define GSF_INSTANTIATE(T)                                                       \
-  template cudaError_t solver_prime<T>(const SolverView<T>&, int, cudaStream_t); \
-  template void solver_to_nodes<T>(const SolverView<T>&, cudaStream_t);          \
-  template void solver_from_nodes<T>(const SolverView<T>&, int, cudaStream_t);   \
-  template void solver_end<T>(const SolverView<T>&, cudaStream_t);               \
+#define GSF_INSTANTIATE(T)                                                             \
+  template void solver_prime_points<T>(const SolverView<T>&, int, bool, cudaStream_t); \
+  template void solver_start<T>(const SolverView<T>&, bool, cudaStream_t);             \
+  template cudaError_t solver_prime<T>(const SolverView<T>&, int, cudaStream_t);       \
+  template void solver_to_nodes<T>(const SolverView<T>&, cudaStream_t);                \
+  template void solver_from_nodes<T>(const SolverView<T>&, int, cudaStream_t);         \
+  template void solver_end<T>(const SolverView<T>&, cudaStream_t);                     \
   template cudaError_t solver_step<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

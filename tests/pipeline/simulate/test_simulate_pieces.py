@@ -16,6 +16,7 @@ from torch import Tensor
 from gsfluent import materials, ops
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.simulate import resident
 from gsfluent.pipeline.simulate.debris import RigidChips, let_go, near_matter, tumble
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.health import figures_of
@@ -260,8 +261,9 @@ def test_pieces_are_looked_for_as_often_as_anything_moves(monkeypatch: pytest.Mo
         assert fastest * (now - before) >= 0.25 * DX
 
 
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
 def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
-    monkeypatch: pytest.MonkeyPatch,
+    device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[Any] = []
     used: set[int] = set()
@@ -274,7 +276,8 @@ def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
     monkeypatch.setattr(ops.Solver, "counters", counters)
     for ranks in (1, 3):
         monkeypatch.setitem(ops.Solver.__init__.__kwdefaults__, "ranks", ranks)
-        *_, last = Simulate(dx=DX, splats=False)(dropped(), fps=20, seconds=0.75)
+        stage = Simulate(dx=DX, splats=False, device=device)
+        *_, last = stage(dropped(), fps=20, seconds=0.75)
         ends.append(last)
     one, several = ends
     assert used == {1, 3} and one.stats["pieces"] > 1 and one.stats["broken_fraction"] > 0.1
@@ -282,3 +285,19 @@ def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
         assert torch.equal(getattr(several.particles, name), getattr(one.particles, name)), name
     assert torch.equal(several.fragments, one.fragments)
     assert several.stats == one.stats
+
+
+@pytest.mark.cuda
+def test_all_devices_give_the_frames_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    if torch.cuda.device_count() < 2:
+        pytest.skip(f"needs two GPUs of one host, this one has {torch.cuda.device_count()}")
+    monkeypatch.setattr(resident, "WORTH_DEVICES", 1)
+    ends = []
+    for every in (False, True):
+        options = SolverOptions(all_devices=every)
+        stage = Simulate(dx=DX, splats=False, device="cuda", options=options)
+        *_, last = stage(dropped(), fps=20, seconds=0.75)
+        ends.append(last)
+    one, several = ends
+    assert one.stats["pieces"] > 1 and several.stats == one.stats
+    assert torch.equal(several.particles.position, one.particles.position)
