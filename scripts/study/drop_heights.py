@@ -105,7 +105,7 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
             rabbet=given["rabbet_m"],
         )  # fmt: skip
     if name == "glass_tumbler":
-        keys = ("diameter_m", "length_m", "wall_m", "base_m")
+        keys: tuple[str, ...] = ("diameter_m", "length_m", "wall_m", "base_m")
         return Case(
             name,
             turned(tumbler(*(given[k] for k in keys)), "y", 85.0),
@@ -124,6 +124,11 @@ def case_of(name: str, given: dict[str, Any]) -> Case:
     return Case(name, ball(given["diameter_m"]), 32.0, 40.0, fruit=fruit)
 
 
+def number(field: float | torch.Tensor | None) -> float:
+    """A field of a material that is the same everywhere."""
+    return float(torch.as_tensor(field))
+
+
 def thicker(material: Material, factor: float, mass: float, volume: float) -> Material:
     """A shell that is thicker than the real one and as stiff and strong under a load at a point.
 
@@ -132,10 +137,10 @@ def thicker(material: Material, factor: float, mass: float, volume: float) -> Ma
     """
     square = factor**2
     return material.override(
-        young_modulus=material.young_modulus / square, softening=material.softening,
-        tensile_strength=material.tensile_strength / square,
-        compressive_strength=material.compressive_strength / square,
-        fracture_energy=material.fracture_energy / factor,
+        young_modulus=number(material.young_modulus) / square, softening=material.softening,
+        tensile_strength=number(material.tensile_strength) / square,
+        compressive_strength=number(material.compressive_strength) / square,
+        fracture_energy=number(material.fracture_energy) / factor,
         reference_volume=material.reference_volume * square, density=mass / volume,
     )  # fmt: skip
 
@@ -399,7 +404,7 @@ def study(
 ) -> dict[str, Any] | None:
     """The record of one object with one stiffness; None where only the work is asked for."""
     drop = Drop(case, given, how, options.device, options.quick)
-    start = given.get("height_m", given.get("survives_m"))
+    start = float(given["height_m"] if "height_m" in given else given["survives_m"])
     ladder = LADDER[::2] if options.quick else LADDER
     work = drop.work(len(ladder)) + drop.work(4 * options.seeds)
     sys.stdout.write(
@@ -422,7 +427,7 @@ def study(
         "restitution": sum(f.restitution for f in whole) / len(whole) if whole else None,
         "restitution_at": whole[0].height if whole else None,
         "cells": round(2.0 * max(case.shape.half) / drop.dx), "dx": drop.dx,
-        "points": drop.points, "mass": float(drop.material.density) * drop.body.volume,
+        "points": drop.points, "mass": number(drop.material.density) * drop.body.volume,
         "kept": kept_strength(drop.material, drop.dx),
         "wave_speed": drop.material.wave_speed, "softening": drop.material.softening,
         "steps": drop.steps, "calls": drop.calls, "simulated": drop.simulated,

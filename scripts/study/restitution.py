@@ -3,8 +3,8 @@
 python scripts/study/restitution.py                   # five minutes of one core; resumable
 python scripts/study/restitution.py --only apple --cells 12 16    # some of it
 
-Balls as in ``drop_heights.py``, with the stiffness of the preset and the real one. One JSON line per
-fruit, stiffness and grid; what is there is not run again. What the literature says stands in
+Balls as in ``drop_heights.py``, with the stiffness of the preset and the real one. One JSON line
+per fruit, stiffness and grid; what is there is not run again. What the literature says stands in
 ``docs/measured/data/restitution.toml``.
 """
 
@@ -71,9 +71,13 @@ def table(rows: list[dict[str, Any]], literature: dict[str, dict[str, Any]]) -> 
             ]  # fmt: skip
             lines.append(f"| {' | '.join(cells)} |")
     clean = sum(r["verdict"] == "clean" for r in rows)
-    lines += ["", f"Within {GOOD} of the literature on every grid: {right} of {count}; grids within "
-              f"{SAME} of each other: {same} of {count}; without a step taken back: {clean} of "
-              f"{len(rows)} landings. {', '.join(sorted({r['device'] for r in rows}))}."]  # fmt: skip
+    devices = ", ".join(sorted({r["device"] for r in rows}))
+    said = (
+        f"Within {GOOD} of the literature on every grid: {right} of {count}; grids within {SAME} "
+        f"of each other: {same} of {count}; without a step taken back: {clean} of {len(rows)} "
+        f"landings. {devices}."
+    )
+    lines += ["", said]
     return "\n".join(lines)
 
 
