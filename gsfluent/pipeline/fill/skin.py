@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.data import Capture, Gaussians
+from gsfluent.data import SURFACE, Capture, Gaussians
+from gsfluent.pipeline.solid.colors import surface_colors
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.tsdf import depth_views
+from gsfluent.spatial.neighbours import nearest
 from gsfluent.spatial.voxels import surface
 
 _GREY = 0.6
@@ -18,6 +21,9 @@ _FLAT = 0.2  # thickness of a splat over its radius
 _MOST = 60_000
 _VIEWS = 24
 _SIZE = 400  # pixels
+_FACES = 0.7  # cosine to a side within which a skin belongs to it
+_BELOW = 0.25  # voxels below the skin: what lies in it is seen beside the object
+_OPAQUE = 0.5
 _SLACK = 1.5  # voxels behind the first surface that still count as seen
 
 
@@ -55,6 +61,51 @@ def skin_gaussians(field: SignedDistance, capture: Capture | None = None) -> Gau
     return Gaussians.from_colors(points, scales, seen, opacities=0.95, quats=made.quats).replace(
         normals=normal
     )
+
+
+@torch.no_grad()
+def unseen_skin(field: SignedDistance, gaussians: Gaussians, side: Sequence[float]) -> Gaussians:
+    """Flat splats on a side that nobody saw, in the colours of the skin around it.
+
+    What photographs contradict at its rim is taken away from the inside, and nothing stands before
+    what is left: the side would be seen some voxels too deep.
+
+    Args:
+        field: The solid.
+        gaussians: Splats of the skin that were seen.
+        side: Unit vector that the side faces.
+
+    Returns:
+        One splat for each voxel of the skin there that has no opaque splat of the skin beside it.
+    """
+    index = np.argwhere(surface(field.inside.cpu().numpy()))
+    values = field.values.cpu()
+    slopes = torch.stack(torch.gradient(values), -1)[tuple(index.T)]
+    normal = torch.nn.functional.normalize(slopes, dim=1)
+    toward = torch.tensor(side, dtype=normal.dtype)
+    there = (normal @ toward > _FACES).nonzero()[:, 0]
+    index, normal = index[there.numpy()], normal[there]
+    center = field.origin.cpu() + (torch.from_numpy(index) + 0.5) * field.voxel
+    depth = values[tuple(index.T)] + _BELOW * field.voxel
+    points = (center - depth[:, None] * normal).float()
+    seen = gaussians.opacities > _OPAQUE
+    if gaussians.labels is not None:
+        seen &= gaussians.labels == SURFACE
+    firm = gaussians.means[seen].detach()
+    if len(firm) and len(points):
+        away = nearest(firm, points.double().numpy(), 1, float(field.voxel))[0][:, 0]
+        bare = torch.from_numpy(away > field.voxel)
+        points, normal = points[bare], normal[bare]
+    size = 0.7 * field.voxel
+    scales = torch.tensor([size, size, _FLAT * size]).repeat(len(points), 1)
+    colors = torch.zeros(0, 3)
+    if len(points):
+        found = surface_colors(gaussians, points.double().numpy(), float(field.voxel))
+        colors = torch.from_numpy(found).float()
+    made = Gaussians.from_colors(
+        points, scales, colors, opacities=0.95, quats=facing(normal), label=SURFACE
+    )
+    return made.to(gaussians.means.device)
 
 
 def _photographed(made: Gaussians, normal: Tensor, capture: Capture, slack: float) -> Tensor:

@@ -15,7 +15,7 @@ from gsfluent.data import SURFACE, Capture, Gaussians, Solid
 from gsfluent.errors import InputError
 from gsfluent.pipeline.fill.interior import Matter, populate
 from gsfluent.pipeline.fill.refine import refine_opacity
-from gsfluent.pipeline.fill.skin import skin_gaussians
+from gsfluent.pipeline.fill.skin import skin_gaussians, unseen_skin
 from gsfluent.pipeline.fill.support import Support
 from gsfluent.pipeline.solid.evidence import Evidence, SolidOptions
 from gsfluent.pipeline.solid.field import SignedDistance
@@ -195,6 +195,11 @@ class Fill(Stage):
                 image_size=self.refine_image_size,
                 progress=progress,
             )
+        side = field.report.get("closed_side")
+        if side is not None:
+            under = unseen_skin(field, merged, side)
+            merged = Gaussians.cat([merged, under])
+            inner = torch.cat([inner, inner.new_zeros(under.count)])
         report_progress(progress, total, total, "filled")
         report = {
             "interior_gaussians": int(inner.sum()),

@@ -97,6 +97,14 @@ def test_missing_underside_is_closed_and_reported() -> None:
     assert report["closed_side"] == [0.0, 0.0, -1.0]
     assert report["leaks"] == 1
     assert report["leaking_voxels"] > 1000
+    # and it has a skin: without one it would be seen as deep as its inside begins
+    g = filled.gaussians
+    under = (g.labels == SURFACE) & (g.means[:, :2].norm(dim=1) < 0.3) & (g.means[:, 2] < 0.0)
+    assert float(under.sum()) * filled.voxel**2 > 0.8 * np.pi * 0.3**2
+    flat = g.select(under)
+    assert float((flat.means[:, 2] + 0.5).abs().max()) < 1.5 * filled.voxel
+    assert float(flat.scales[:, 2].max()) < 0.2 * filled.voxel
+    assert not bool(((g.labels == SURFACE) & (g.means[:, 2] < -0.5 - 2.0 * filled.voxel)).any())
 
 
 def test_bare_flood_fill_would_have_lost_the_object() -> None:
