@@ -6,12 +6,13 @@ See docs/theory/ranks.md.
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from gsfluent.errors import InputError
+from gsfluent.errors import GsfluentError, InputError
 from gsfluent.ops import solver_buffers as layout
 
 MOST_RANKS = 64
@@ -20,6 +21,8 @@ VIEW_BYTES = 1024
 """``kViewBytes`` of it."""
 MAIL_WORDS = 11
 """``kMailWords`` of ``csrc/core/solver/state.h``."""
+PATIENCE = 60.0
+"""Wall time without a finished step after which a device counts as stalled [s]."""
 
 _POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
            "place", "viscous", "own")  # fmt: skip
@@ -137,10 +140,43 @@ class Parts:
             part.impulse_units.zero_()
         torch.ops.gsfluent.solver_prime_ranks(*self._lists(), not self.away)
         self.away = True
+        self._wait()
 
     def run(self, rounds: int, steps: int) -> None:
         """As ``solver_run``."""
         torch.ops.gsfluent.solver_run_ranks(*self._lists(), rounds, steps)
+        self._wait()
+
+    def _wait(self) -> None:
+        """Wait for what was asked of the devices, as long as steps are finished.
+
+        Raises:
+            GsfluentError: A device failed, or none finished a step for :data:`PATIENCE`.
+        """
+        names = ", ".join(dict.fromkeys(str(device) for device in self.devices))
+        home = self.whole.clock.device
+        try:
+            done = torch.cuda.Event()
+            done.record(torch.cuda.current_stream(home))
+            beside = torch.cuda.Stream(home)
+            step, since = -1, time.monotonic()
+            while not done.query():
+                time.sleep(1e-4)
+                if time.monotonic() - since < PATIENCE:
+                    continue
+                with torch.cuda.stream(beside):  # past what waits in the other one
+                    now = int(self.whole.clock[layout.INDEX["step"]].cpu())
+                if now == step:
+                    raise GsfluentError(
+                        f"solver: no step on {names} was finished in {PATIENCE:g} s\n"
+                        "  hint: nvidia-smi shows which of them hangs; start anew without it"
+                    )
+                step, since = now, time.monotonic()
+        except RuntimeError as error:
+            raise GsfluentError(
+                f"solver: one of {names} failed: {error}\n"
+                "  hint: nvidia-smi and dmesg show which and why; start anew without it"
+            ) from error
 
     def gather(self) -> None:
         """Bring the points back, if they are away."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -10,8 +12,9 @@ from solver_scenes import DX, bullet, scene
 from test_solver_cpu import STATE, broken, mixed_rows, shuffled, small
 
 from gsfluent import ops
-from gsfluent.errors import InputError
+from gsfluent.errors import GsfluentError, InputError
 from gsfluent.lab.world.shapes import parameters
+from gsfluent.ops import solver_ranks
 from gsfluent.ops.plasticity import PHASE_CODES
 
 DTYPES = [torch.float32, torch.float64]
@@ -309,6 +312,29 @@ def test_what_ranks_do_not_know_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"2 ranks do not know law phase_field \(9\) yet"):
         ops.Solver(**given, ranks=2)
     ops.Solver(**given, ranks=1)
+
+
+@pytest.mark.parametrize(
+    "answer, why",
+    [
+        (False, "no step on cuda:0, cuda:1 was finished in 0"),
+        (RuntimeError("gone"), "failed: gone"),
+    ],
+)
+def test_a_device_that_does_not_answer_is_an_error(
+    answer: Any, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver = ops.Solver(**small("elastic"))
+    parts = object.__new__(solver_ranks.Parts)
+    parts.whole, parts.devices = solver._buffers, (torch.device("cuda:0"), torch.device("cuda:1"))
+    event = MagicMock()
+    event.query.side_effect = itertools.repeat(answer) if answer is False else answer
+    monkeypatch.setattr(torch.cuda, "Event", lambda: event)
+    for name in ("Stream", "stream", "current_stream"):
+        monkeypatch.setattr(torch.cuda, name, MagicMock())
+    monkeypatch.setattr(solver_ranks, "PATIENCE", 0.0)
+    with pytest.raises(GsfluentError, match=why):
+        parts._wait()
 
 
 def test_nothing_is_cut_before_a_step() -> None:

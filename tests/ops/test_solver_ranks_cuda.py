@@ -11,7 +11,8 @@ from test_solver_cpu import STATE, shuffled, small
 from test_solver_ranks import CASES, DTYPES, dust
 
 from gsfluent import has_cuda, ops
-from gsfluent.errors import InputError
+from gsfluent.errors import GsfluentError, InputError
+from gsfluent.ops import solver_ranks
 
 pytestmark = [
     pytest.mark.cuda,
@@ -156,6 +157,27 @@ def test_the_same_failure_at_the_same_step() -> None:
             run(given, ranks=ranks, dt=6e-3)
         told.append(str(failure.value))
     assert told[0] == told[1]
+
+
+def test_a_device_that_stands_still_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = here(small("elastic", torch.float32))
+    several = torch.cuda.device_count() > 1
+    where = {"devices": devices()} if several else {"ranks": 2}
+    solver = ops.Solver(**given, **where)
+    whole = solver_ranks.Parts._lists
+
+    def slowly(parts: solver_ranks.Parts) -> Any:
+        with torch.cuda.device(1 if several else 0):
+            torch.cuda._sleep(6_000_000_000)  # about 3 s
+        return whole(parts)
+
+    monkeypatch.setattr(solver_ranks, "PATIENCE", 0.2)
+    monkeypatch.setattr(solver_ranks.Parts, "_lists", slowly)
+    with pytest.raises(GsfluentError, match=r"no step on cuda:0.* was finished in 0.2 s"):
+        solver.advance(steps=1)
+    monkeypatch.undo()
+    torch.cuda.synchronize()
+    assert_equal(run(given, **where), run(given))
 
 
 def test_points_must_lie_on_one_of_the_devices() -> None:

@@ -30,14 +30,14 @@ __global__ void __launch_bounds__(kThreads) join_kernel(const __grid_constant__ 
     if (s.clock->wanted_homes != 0) clock.wanted_homes = s.clock->wanted_homes;
   }
   if (e >= s.table_size || s.table_count[e] == 0) return;
-  const int32_t joined = insert(all, s.key[e]);
+  const int32_t joined = insert<true>(all, s.key[e]);
   s.table_home[e] = joined;
   if (joined < 0) {
     clock.wanted_homes = all.table_size;
     return;
   }
-  s.table_slot[e] = atomicAdd(all.table_count + joined, s.table_count[e]);
-  atomicOr(reinterpret_cast<uint32_t*>(all.table_mask + joined), uint32_t(s.table_mask[e]));
+  s.table_slot[e] = atomicAdd_system(all.table_count + joined, s.table_count[e]);
+  atomicOr_system(reinterpret_cast<uint32_t*>(all.table_mask + joined), uint32_t(s.table_mask[e]));
 }
 
 // Cuts across the longest axis, and within a layer of blocks across the second: the rank that owns
@@ -227,7 +227,8 @@ __global__ void __launch_bounds__(kThreads) copy_kernel(const __grid_constant__ 
 
 __device__ void join_bits(uint64_t* to, uint64_t bits) {
   if ((*to & bits) != bits)
-    atomicOr(reinterpret_cast<unsigned long long*>(to), static_cast<unsigned long long>(bits));
+    atomicOr_system(reinterpret_cast<unsigned long long*>(to),
+                    static_cast<unsigned long long>(bits));
 }
 
 template <typename T>

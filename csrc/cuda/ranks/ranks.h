@@ -31,11 +31,13 @@ struct Fleet {
       return cudaSuccess;  // one stream for all
     for (int r = 0; r <= count; ++r) {
       if (!first_there(r)) continue;
+      cudaSetDevice(device[r]);  // a default stream is that of the device at hand
       const cudaError_t error = cudaEventRecord(event[r], stream[r]);
       if (error != cudaSuccess) return error;
     }
     for (int r = 0; r <= count; ++r) {
       if (!first_there(r)) continue;
+      cudaSetDevice(device[r]);
       for (int q = 0; q <= count; ++q) {
         if (!first_there(q) || device[q] == device[r]) continue;
         const cudaError_t error = cudaStreamWaitEvent(stream[r], event[q], 0);

@@ -12,14 +12,15 @@ constexpr int kThreads = kSolverThreads;
 constexpr int kRanks = 64;      // ranks inside a cell that the stripe order knows
 constexpr int kPlaceBits = 26;  // of the place of a point on its rank, which stands above them
 
-// Entry of a key, inserted when absent; -1 when the table is full.
-template <typename T>
+// Entry of a key, inserted when absent; -1 when the table is full. kFar: from several devices.
+template <bool kFar = false, typename T>
 __device__ int32_t insert(const SolverView<T>& s, uint64_t key) {
   const uint64_t mask = uint64_t(s.table_size) - 1;
   uint64_t at = hash_key(key) & mask;
   for (int64_t tries = 0; tries < s.table_size; ++tries, at = (at + 1) & mask) {
+    unsigned long long* entry = reinterpret_cast<unsigned long long*>(s.key + at);
     const unsigned long long before =
-        atomicCAS(reinterpret_cast<unsigned long long*>(s.key + at), kNoKey, key);
+        kFar ? atomicCAS_system(entry, kNoKey, key) : atomicCAS(entry, kNoKey, key);
     if (before == kNoKey || before == key) return static_cast<int32_t>(at);
   }
   return -1;

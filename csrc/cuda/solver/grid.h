@@ -60,6 +60,10 @@ __device__ inline long long warp_sum(long long v) {
 __device__ inline void add_units(void* to, long long units) {
   atomicAdd(static_cast<unsigned long long*>(to), static_cast<unsigned long long>(units));
 }
+// The same in memory that may be another device's.
+__device__ inline void add_far(void* to, long long units) {
+  atomicAdd_system(static_cast<unsigned long long*>(to), static_cast<unsigned long long>(units));
+}
 
 // Sums of the first few colliders over a CTA. All nodes of a scene meet at those few words, so they
 // are added up as far as possible before they get there.

@@ -111,6 +111,12 @@ class Ranks {
     STD_TORCH_CHECK(can != 0, "solver: device cuda:", device,
                     " cannot reach the memory of cuda:", other,
                     "; name devices of one host that are linked (nvidia-smi topo -p2p r)");
+    int adds = 0;
+    check_cuda("solver_ranks", cudaDeviceGetP2PAttribute(&adds, cudaDevP2PAttrNativeAtomicSupported,
+                                                         device, other));
+    STD_TORCH_CHECK(adds != 0, "solver: device cuda:", device,
+                    " cannot add in the memory of cuda:", other,
+                    "; name devices that NVLink joins (nvidia-smi topo -p2p a)");
     check_cuda("solver_ranks", cudaSetDevice(device));
     const cudaError_t error = cudaDeviceEnablePeerAccess(other, 0);
     if (error == cudaErrorPeerAccessAlreadyEnabled)

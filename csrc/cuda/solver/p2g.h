@@ -142,9 +142,8 @@ __device__ __forceinline__ void give_node(const SolverView<T>& s, int64_t node, 
     const long long v = units(c);
     if (v == 0) continue;
     add_units(sums(s) + kWords * node + c, v);
-    for_others_of(s, holders, [&](const SolverView<T>& other) {
-      add_units(sums(other) + kWords * node + c, v);
-    });
+    for_others_of(s, holders,
+                  [&](const SolverView<T>& other) { add_far(sums(other) + kWords * node + c, v); });
   }
 }
 

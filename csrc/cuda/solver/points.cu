@@ -97,7 +97,7 @@ __device__ void note_given(const SolverView<T>& s, int which, int64_t home, floa
 template <typename T>
 __device__ void note_slot(const SolverView<T>& s, int which, int64_t slot) {
   int32_t* note = s.slot_given + slot;
-  if ((*static_cast<volatile int32_t*>(note) >> which & 1) == 0) atomicOr(note, 1 << which);
+  if ((*static_cast<volatile int32_t*>(note) >> which & 1) == 0) atomicOr_system(note, 1 << which);
 }
 // Of several ranks: the largest number that any of them gives.
 template <typename T>
