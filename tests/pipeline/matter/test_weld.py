@@ -129,6 +129,7 @@ def test_a_weld_changes_no_stress_energy_or_momentum() -> None:
         velocity=torch.randn(count, 3, generator=generator, dtype=torch.float64),
         **{name: getattr(p, name).double() for name in ("position", "mass", "volume", "affine")},
         deformation=None if p.deformation is None else p.deformation.double(),
+        viscous=None if p.viscous is None else p.viscous.double(),
     )  # fmt: skip
     state = state._replace(
         particles=particles, peak=torch.maximum(alpha, state.peak.double()), alpha_seen=alpha

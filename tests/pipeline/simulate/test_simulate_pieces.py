@@ -28,9 +28,10 @@ DX = 0.02
 
 
 def dropped(height: float = 1.5) -> Scene:
-    """A melon over the floor, 13 cells across."""
+    """A melon over the floor, 13 cells across, thrown down: it lands as from 1 m higher."""
     scene = Scene(floor=0.0)
-    scene.add(ellipsoid((0.125, 0.105, 0.105), voxels=40), materials.fruit.watermelon)
+    melon = materials.fruit.watermelon
+    scene.add(ellipsoid((0.125, 0.105, 0.105), voxels=40), melon, velocity=(0.0, 0.0, -4.5))
     scene.drop(height)
     return scene
 
