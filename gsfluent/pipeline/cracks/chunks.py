@@ -62,6 +62,8 @@ FIRM = 5
 STRAY, BAND = 1.0, 4.0
 """A broken point this many spacings from where unbroken ones of its chunk carry its place is crumb
 as well; asked of points that lay so many spacings from those, the width of a crack band."""
+FAR = 4.0
+"""A splat does not go to a part whose points are all farther away than this [spacings]."""
 LUMP = 64
 """Points of one piece that hang together, below which they are crumbs as well."""
 _NUMBERS = 1 << 54  # ids of face elements begin here, beyond those of births
@@ -296,11 +298,17 @@ class Chunks:
         rows = sides.among(self._region)
         seen, of = Splits(splits), sides.of[self._region[rows]]
         here, cuts = find_cuts(partition, seen, splats, rows, of)
-        self._region = self._region.index_copy(0, rows, here)
         owner, means = self._owner[rows], splats.means[rows]
         # what follows a liquid stays with it
         wrong = ((self._chunk[owner] != here) & self._may[owner]).nonzero()[:, 0]
-        owner[wrong] = sides.own(means[wrong], here[wrong])
+        other = sides.own(means[wrong], here[wrong])
+        # off the matter a label may be that of a part which is nowhere near
+        stays = (matter.rest[other] - means[wrong]).norm(dim=1) > FAR * matter.spacing[body]
+        owner[wrong[~stays]] = other[~stays]
+        lost = wrong[stays]
+        here[lost] = self._chunk[owner[lost]]
+        cuts = ChunkCuts(*(part[~torch.isin(cuts.splat, rows[lost])] for part in cuts))
+        self._region = self._region.index_copy(0, rows, here)
         self._owner = self._owner.index_copy(0, rows, owner)
         self._burn(rows[sides.ash[here]], sides)
         high = relief(self._scene.bodies[body].material.name)

@@ -38,13 +38,16 @@ GRAIN = 2.2e-3
 only some of the points have one."""
 SHARE, LARGEST = 1.0 / 25.0, 1.0 / 8.0
 """Smallest chip, at most, and largest, as shares of the edge of a cube of the body's volume."""
-MIST = (0.1, 0.35)
+MIST = (0.1, 0.25)
 """Share of dust that is mist: of powder, of juice."""
 FINE = 5e-4
 """Mean size of the drops of mist [m] (Sauter): its volume over that is what it hides."""
 PUFF, GROWTH, WIDEST = 0.6, 0.12, 5.0
 """Standard deviation of a puff when it leaves [edges], by how much of its way it grows, and how
 large it gets at most [edges]: then it is thinner than the eye can tell."""
+THINNEST = 0.02
+"""Opacity that a puff has less than its drops hide: a picture leaves out what is thinner than
+1 / 255, and hundreds of wide puffs that end there one behind the other would show an edge."""
 PALE = 0.35
 """How far mist is paler than what it is of: it scatters light many times."""
 MOST = 60_000
@@ -282,7 +285,8 @@ class Grains:
         scales = torch.where(puff[:, None], wide[:, None] * scales.new_tensor(_PUFF), scales)
         # as many drops as are beside each other in the middle of the puff hide what is behind it
         hidden = 1.5 * self.amount[some] / FINE / (2.0 * math.pi * wide.double().square())
-        opacity = torch.where(puff, (1.0 - torch.exp(-hidden)).clamp(max=OPACITY), OPACITY)
+        thin = (1.0 - torch.exp(-hidden) - THINNEST).clamp(0.0, OPACITY)
+        opacity = torch.where(puff, thin, OPACITY)
         opacity = opacity.float() * left
         if floor is not None:
             # what lies on the floor is no heap

@@ -10,7 +10,13 @@ from gsfluent import materials, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
-from gsfluent.pipeline.cracks.chunk_faces import ChunkCuts, ChunkFaces, find_faces, wide_cuts
+from gsfluent.pipeline.cracks.chunk_faces import (
+    ChunkCuts,
+    ChunkFaces,
+    find_cuts,
+    find_faces,
+    wide_cuts,
+)
 from gsfluent.pipeline.cracks.chunks import OPACITY
 from gsfluent.pipeline.cracks.cuts import in_turns
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
@@ -95,6 +101,27 @@ def test_a_chip_keeps_its_shape_where_its_points_run_apart(bound: Carry) -> None
     flown = whole[:, 0] > 1.0
     assert int(flown.sum()) > 20
     assert float((whole - scattered)[flown].norm(dim=1).max()) < 1e-3 * spacing
+
+
+def test_a_splat_does_not_go_to_a_part_that_is_far_away(
+    bound: Carry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Splats off the matter had labels of the other half, and flew beside it as slivers."""
+    far = int(bound.gaussians.means[:, 0].argmin())
+
+    def mistaken(partition, seen, splats, rows, of):
+        here, cuts = find_cuts(partition, seen, splats, rows, of)
+        place = (rows == far).nonzero()[:, 0]
+        here[place] = 1 - here[place]
+        return here, cuts
+
+    monkeypatch.setattr("gsfluent.pipeline.cracks.chunks.find_cuts", mistaken)
+    history = Repair().begin(bound)
+    done = drawn(bound, history, moment(bound, halves(bound), apart(bound, 0.3)))
+    assert bound.gaussians.means[far, 0] < -5.0 * bound.matter.spacing[0]
+    moved = done.gaussians.means[far] - bound.gaussians.means[far]
+    assert float(moved.norm()) < 0.1 * bound.matter.spacing[0]
+    assert int(history._gaps._region[far]) == int(history._gaps._chunk[done.anchor[far]])
 
 
 @pytest.mark.parametrize("material", ["glass", "ceramic", "egg", "fruit.apple", "chocolate"])

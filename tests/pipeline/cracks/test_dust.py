@@ -15,6 +15,7 @@ from gsfluent.pipeline.cracks.dust import (
     MIST,
     MOST,
     SIDES,
+    THINNEST,
     grains,
     per_point,
     sizes,
@@ -108,17 +109,19 @@ def test_a_chip_from_the_skin_wears_it_on_one_side(bound: Carry) -> None:
 
 
 def test_mist_hides_what_its_drops_hide(bound: Carry) -> None:
-    """And ever less as it spreads; near the end nothing of it is to be seen."""
+    """And ever less as it spreads; in the end nothing at all: a picture leaves out what is thinner
+    than 1 / 255, and where hundreds of puffs ended one behind the other there was an edge."""
     amount = 2e-3**3 * MIST[1]
     before = 1.0
-    for way in (0.02, 0.05):
+    for way in (0.01, 0.02):
         _, (_, mist) = flown(bound, way)
         wide = mist.scales[:, 0].double()
-        seen = -(1.0 - mist.opacities.double()).log() * 2.0 * torch.pi * wide.square()
+        seen = -(1.0 - THINNEST - mist.opacities.double()).log() * 2.0 * torch.pi * wide.square()
         assert torch.allclose(seen, torch.full_like(seen, 1.5 * amount / FINE), rtol=1e-3)
         assert float(mist.opacities.max()) < 0.5 * before
         before = float(mist.opacities.min())
-    assert before < 0.05
+    _, (_, mist) = flown(bound, 0.1)
+    assert float(mist.opacities.max()) == 0.0
 
 
 def test_a_row_has_its_grains_whatever_is_around() -> None:
