@@ -33,12 +33,18 @@ def watching(watcher: Watcher) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
+def atomic_path(path: str | Path, *, synced: bool = True) -> Iterator[Path]:
     """Yield a temporary name beside ``path``; rename it onto ``path`` when the block ends well.
 
     The temporary keeps the suffix (writers that look at it work) and lies in the same directory, so
     the rename is one step of the file system. When the block fails, Ctrl-C included, the temporary
     is removed and an older ``path`` stays as it was.
+
+    Args:
+        path: Where the file shall appear.
+        synced: Wait until its bytes are on the disk, so that it is whole after a power cut, too.
+            What has a digest (:mod:`gsfluent.results.digests`) needs no such wait: a torn file
+            would be noticed and made again.
 
     Raises:
         RunError: The disk is full or the folder cannot be written.
@@ -48,8 +54,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
-        with open(temporary, "rb") as stream:
-            os.fsync(stream.fileno())
+        if synced:
+            with open(temporary, "rb") as stream:
+                os.fsync(stream.fileno())
         for watcher in _watchers:
             watcher(temporary, path)
         os.replace(temporary, path)

@@ -125,7 +125,7 @@ def write_frame(folder: Path, index: int, arrays: dict[str, np.ndarray]) -> Path
         RunError: The disk is full.
     """
     path = frame_path(folder, index)
-    with atomic_path(path) as part, part.open("wb") as stream:
+    with atomic_path(path, synced=False) as part, part.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
     return path
 

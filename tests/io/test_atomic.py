@@ -51,3 +51,15 @@ def test_json_has_no_nan(tmp_path: Path) -> None:
         "path": str(tmp_path),
         "3": [1, 2],
     }
+
+
+def test_only_what_has_no_digest_waits_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[int] = []
+    monkeypatch.setattr("gsfluent.io.atomic.os.fsync", waits.append)
+    for synced in (False, True):
+        with atomic_path(tmp_path / "file", synced=synced) as temporary:
+            temporary.write_text("whole")
+        assert (tmp_path / "file").read_text() == "whole"
+        assert len(waits) == int(synced)

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent.geometry import matrix_to_quaternion
+from gsfluent import ops
+from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.pipeline.liquid.depth import deep
 from gsfluent.spatial.neighbours import nearest_rows
 
@@ -96,8 +97,10 @@ def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> E
     middle = (weight[..., None] * arm).sum(dim=1)
     arm = arm - middle[:, None]
     covariance = torch.einsum("nk,nki,nkj->nij", weight, arm, arm)
-    value, axes = torch.linalg.eigh(covariance)
-    value, axes = value.flip(1).clamp(min=1e-30), axes.flip(2)
+    packed = covariance.flatten(1)[:, [0, 4, 8, 1, 2, 5]]
+    # the library's own solver of many matrices gives up on a GPU now and then
+    quats, deviation = ops.covariance_axes(packed.contiguous())
+    value, axes = deviation.square().clamp(min=1e-30), quaternion_to_matrix(quats)
     # From nothing at half of FEW to everything at FEW: a neighbourhood gets its shape gently.
     inside = (distance <= reach).sum(dim=1).double()
     known = ((inside - 0.5 * FEW) / (0.5 * FEW)).clamp(0.0, 1.0)[:, None]
@@ -118,8 +121,6 @@ def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> E
     thick = torch.maximum(thick, wide[:, :1] / RATIO)
     thick = torch.minimum(thick, wide[:, 1:])
     scales = torch.cat([wide, thick], dim=1)
-    axes = axes * torch.linalg.det(axes).sign()[:, None, None]
-    quats = matrix_to_quaternion(axes)
     return Ellipsoids(means, quats, scales, shape, sheet[:, 0])
 
 
