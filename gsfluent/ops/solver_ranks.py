@@ -6,6 +6,7 @@ See docs/theory/ranks.md.
 from __future__ import annotations
 
 import dataclasses
+import os
 import time
 from collections.abc import Sequence
 
@@ -64,6 +65,13 @@ def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> 
         raise InputError(
             f"Solver: devices: at most {MOST_RANKS}, got {len(found)}", hint="name fewer"
         )
+    for name in ("PYTORCH_CUDA_ALLOC_CONF", "PYTORCH_ALLOC_CONF"):
+        if len(set(found)) > 1 and "expandable_segments:true" in os.environ.get(name, "").lower():
+            raise InputError(
+                f"Solver: devices: {name} asks for expandable segments, which other devices cannot "
+                "reach",
+                hint=f"start without expandable_segments in {name}",
+            )
     for device in found:
         for other in found:
             if device != other and not torch.cuda.can_device_access_peer(device, other):

@@ -306,6 +306,24 @@ def test_devices_that_are_none_are_refused(named: list[str], why: str) -> None:
         ops.Solver(**small("elastic"), devices=named)
 
 
+def test_devices_that_cannot_reach_each_other_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pair, home = ["cuda:0", "cuda:1"], torch.device("cuda:0")
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 3)
+    monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda a, b: True)
+    monkeypatch.delenv("PYTORCH_CUDA_ALLOC_CONF", raising=False)
+    assert solver_ranks.check_devices(pair, home) == [torch.device(name) for name in pair]
+    with pytest.raises(InputError, match="the points lie on cuda:2"):
+        solver_ranks.check_devices(pair, torch.device("cuda:2"))
+    monkeypatch.setattr(torch.cuda, "can_device_access_peer", lambda a, b: False)
+    with pytest.raises(InputError, match="cuda:0 cannot reach the memory of cuda:1"):
+        solver_ranks.check_devices(pair, home)
+    monkeypatch.setenv("PYTORCH_CUDA_ALLOC_CONF", "expandable_segments:True")
+    with pytest.raises(InputError, match="expandable segments"):
+        solver_ranks.check_devices(pair, home)
+
+
 def test_what_ranks_do_not_know_is_refused_by_name() -> None:
     row = parameters(1e5, 0.3, 1.0, c2=1.0, c3=0.04, c4=0.02, c5=PHASE_CODES[0])
     given = of_law(9, row)(torch.float32)
