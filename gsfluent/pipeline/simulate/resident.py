@@ -44,8 +44,8 @@ LOOK = 8
 """Steps between two looks at how fast matter is, while a collider is much faster."""
 STEADY = 0.9
 """Factor on the time step above which that need not be."""
-WORTH_DEVICES = 400_000
-"""Points from which several GPUs may be faster than one (docs/theory/ranks.md)."""
+WORTH_DEVICES = 1_000_000
+"""Points from which several GPUs may be faster than one (docs/measured/benchmarks.md)."""
 OUTWEIGHS = 0.5
 """Least mass of a free body for the resident solver, in masses of the matter that it can touch:
 what it strikes first lies on one side of it."""
