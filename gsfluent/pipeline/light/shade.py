@@ -82,6 +82,13 @@ def surface_points(depth: Tensor, viewmat: Tensor, K: Tensor) -> tuple[Tensor, T
     return eye + depth[..., None] * rays, normalize(rays, dim=-1)
 
 
+def pixel_rays(pixels: Tensor, width: int, viewmat: Tensor, K: Tensor) -> Tensor:
+    """Unit rays [M, 3] from the eye through some pixels, int64 [M], of a picture row by row."""
+    x, y = (pixels % width).to(K) + 0.5, (pixels // width).to(K) + 0.5
+    ray = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(x)], 1)
+    return normalize(ray @ viewmat[:3, :3], dim=1)
+
+
 def shade_points(
     points: Tensor,
     normal: Tensor,

@@ -5,7 +5,8 @@ from gsfluent._lazy import room
 __getattr__, __dir__, __all__ = room(
     __name__,
     clear="OPACITY Clear Surface body_opacities ceiling covered in_front mirrored smoothed "
-    "surface_normals",
+    "span surface_normals",
+    closing="closed",
     looks="Liquids",
     nozzle="WAITING pours",
     parts="LiquidParts",

@@ -109,7 +109,7 @@ def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
     middle = float(depth[there].median())
     sigma = min(SMOOTH * spacing * float(camera.K[0, 0]) / middle, MOST_PIXELS)
     reach = math.ceil(2.5 * sigma)
-    rows, columns = (_span(there.any(dim=dim)) for dim in (1, 0))
+    rows, columns = (span(there.any(dim=dim)) for dim in (1, 0))
     # the longer a blended normal is, the surer: near and far side of an outline cancel each other
     values = torch.cat([surface.normal, depth[..., None]], dim=2)[rows, columns]
     weight = (surface.alpha * there)[rows, columns]
@@ -124,10 +124,10 @@ def smoothed(surface: Surface, spacing: float, camera: Camera) -> Surface:
     return Surface(surface.alpha, made[..., 3], made[..., :3])
 
 
-def _span(there: Tensor) -> slice:
-    """From the first to the last of what is there."""
+def span(there: Tensor, more: int = 0) -> slice:
+    """From the first to the last of what is there, and so many more at either end."""
     found = there.nonzero()
-    return slice(int(found[0]), int(found[-1]) + 1)
+    return slice(max(int(found[0]) - more, 0), int(found[-1]) + 1 + more)
 
 
 def covered(surface: Surface, spacing: float, camera: Camera) -> Tensor:
@@ -172,19 +172,19 @@ def in_front(surface: Surface, alpha: Tensor, depth: Tensor, spacing: float) -> 
 
 
 def mirrored(normal: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """What a surface reflects: its share [H, W] by Schlick (1994), and from where, [H, W, 3].
+    """What a surface reflects: its share [...] by Schlick (1994), and from where, [..., 3].
 
     Args:
-        normal: Unit normals toward the eye, [H, W, 3].
-        rays: Unit vectors from the eye, [H, W, 3].
+        normal: Unit normals toward the eye, [..., 3].
+        rays: Unit vectors from the eye, [..., 3].
     """
-    facing = -(normal * rays).sum(dim=2).clamp(max=0.0)
+    facing = -(normal * rays).sum(dim=-1).clamp(max=0.0)
     share = FACE_ON + (1.0 - FACE_ON) * (1.0 - facing).clamp(0.0, 1.0) ** 5
-    return share, normalize(rays + 2.0 * facing[..., None] * normal, dim=2)
+    return share, normalize(rays + 2.0 * facing[..., None] * normal, dim=-1)
 
 
 def ceiling(toward: Tensor) -> Tensor:
-    """Radiance [H, W] of the bright ceiling in directions [H, W, 3]."""
+    """Radiance [...] of the bright ceiling in directions [..., 3]."""
     low, high = CEILING
     share = ((toward[..., 2] - low) / (high - low)).clamp(0.0, 1.0)
     return BRIGHT * share * share * (3.0 - 2.0 * share)

@@ -23,7 +23,7 @@ from gsfluent.errors import InputError
 from gsfluent.pipeline.light.lamps import SHININESS, SPECULAR, Lighting, pack_lamps
 from gsfluent.pipeline.light.normals import Grid, grid_for, plate_normals, splat_normals
 from gsfluent.pipeline.light.occlusion import Occupancy
-from gsfluent.pipeline.light.shade import irradiance, surface_points, to_display, to_linear
+from gsfluent.pipeline.light.shade import irradiance, pixel_rays, to_display, to_linear
 from gsfluent.pipeline.light.shadow_maps import Bulk, Lit, bulk, faces_of, shadow_maps
 from gsfluent.pipeline.liquid.clear import (
     OPACITY,
@@ -31,12 +31,12 @@ from gsfluent.pipeline.liquid.clear import (
     Surface,
     body_opacities,
     ceiling,
-    covered,
     in_front,
     mirrored,
     smoothed,
     surface_normals,
 )
+from gsfluent.pipeline.liquid.closing import closed
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.merge import merged
 from gsfluent.pipeline.render.studio import Studio
@@ -169,23 +169,25 @@ class Render(Stage):
         eye = -(view[0][:3, 3] @ view[0][:3, :3])
         lighting = None if self.light is None else self.light.at(time)
         everything, dense = (gaussians, groups), gaussians
-        if clear is not None and bool(clear.rows.any()) and not bool(clear.rows.all()):
+        wet = None
+        if clear is not None and bool(clear.rows.any()):
             everything = (_as_body(gaussians, clear, eye), groups)
             through = clear.rows.masked_scatter(clear.rows, clear.attenuation.isfinite())
-            dense = gaussians.select((~through).nonzero()[:, 0])
+            if not bool(through.all()):
+                dense = gaussians.select((~through).nonzero()[:, 0])
+            wet = _liquid(everything, clear, camera, view)
             rest = (~clear.rows).nonzero()[:, 0]
             gaussians = gaussians.select(rest)
             groups, gloss, plates, rigid = (
                 None if value is None else value[rest] for value in (groups, gloss, plates, rigid)
             )
-        else:
-            clear = None
         lit, extras = None, None
         if lighting is not None:
             lit, room = self._light(dense, camera, lighting, everything, room)
             extras = splat_normals(gaussians, lit.grid, eye)
             if plates is not None:
-                extras = torch.where(plates[:, None], plate_normals(gaussians, eye), extras)
+                flat = plates.nonzero()[:, 0]
+                extras = extras.index_copy(0, flat, plate_normals(gaussians.select(flat), eye))
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
         layers: list[Tensor | None] = [None]
@@ -210,11 +212,16 @@ class Render(Stage):
         image, alpha, depth = seen.image, seen.alpha, seen.depth
         behind = _constant(self.background, means.dtype, means.device)
         whole = lit is not None and backdrop is None  # object, floor and backdrop at once
+        if wet is not None:
+            wet = wet.before(alpha, depth)
         if lit is not None and lighting is not None and seen.normal is not None:
             vectors, gloss = _gloss(lighting, seen.normal, alpha)
+            planes = (image, alpha, depth, vectors)
+            if wet is not None and wet.opaque and whole:
+                wet, planes, gloss = wet.shaded_with(planes, gloss)
             ground = behind if whole else torch.zeros_like(behind)
             floor = self.studio if whole else None
-            image = _shaded((image, alpha, depth, vectors), gloss, view, lit, ground, floor)
+            image = _shaded(planes, gloss, view, lit, ground, floor)
         if not whole:
             if self.studio is not None:
                 light = _plain_light(image) if lit is None else lit
@@ -237,10 +244,8 @@ class Render(Stage):
                 before = (opaque > 0.5) & (away < depth)[..., None] & (cover > 0.0)
                 image = torch.where(before, captured + image * (1.0 - opaque), image)
             image = image.clamp(0.0, 1.0)
-        if clear is not None:
-            image, alpha, depth = _wetted(
-                (image, alpha, depth), everything, clear, camera, view, lit
-            )
+        if wet is not None:
+            image, alpha, depth = _wetted((image, alpha, depth), wet, view, lit)
         report = {
             "gaussians": everything[0].count,
             "lamps": 0 if lit is None else len(lit.lamps),
@@ -298,11 +303,105 @@ def _as_body(gaussians: Gaussians, clear: Clear, eye: Tensor) -> Gaussians:
     )
 
 
-def _wetted(
-    behind: tuple[Tensor, Tensor, Tensor],
+@dataclass(frozen=True)
+class _Wet:
+    """The liquids of a picture.
+
+    Attributes:
+        surface: Smoothed, without gaps.
+        body: Colour and opacity where the surface has all of its, [H, W, 4].
+        there: Opacity of the surface less where other things hide it, [H, W].
+        done: Pixels whose light is in the picture of the rest already, bool [H, W].
+        gloss: k_s and n_s, [2].
+        opaque: No light goes through any of them.
+        shadowed: What is opaque among them hides the surroundings of the others.
+        spacing: Of their points [m].
+    """
+
+    surface: Surface
+    body: Tensor
+    there: Tensor
+    done: Tensor
+    gloss: Tensor
+    opaque: bool
+    shadowed: bool
+    spacing: float
+
+    def before(self, alpha: Tensor, depth: Tensor) -> _Wet:
+        """With what other things, their opacity and depth [H, W], leave to be seen."""
+        return replace(self, there=in_front(self.surface, alpha, depth, self.spacing))
+
+    def shaded_with(
+        self, planes: tuple[Tensor, Tensor, Tensor, Tensor], gloss: Tensor | None
+    ) -> tuple[_Wet, tuple[Tensor, Tensor, Tensor, Tensor], Tensor | None]:
+        """The planes of all else, and its gloss, with the liquid where it hides all else.
+
+        What is behind it needs no light, and the liquid none of its own.
+        """
+        done = self.there > 0.999
+        mine, alpha = done[..., None], planes[1]
+        vectors, ours = planes[3], self.gloss.expand(*done.shape, 2)
+        if gloss is not None:
+            vectors = torch.cat([vectors[..., :3], gloss * alpha[..., None]], dim=2)
+        normal = torch.cat([self.surface.normal, ours.to(vectors)], dim=2)
+        made = (
+            torch.where(mine, self.body[..., :3], planes[0]),
+            alpha.masked_fill(done, 1.0),
+            torch.where(done, self.surface.depth, planes[2]),
+            torch.where(mine, normal, vectors),
+        )
+        return replace(self, done=done), made, None
+
+
+def _liquid(
     everything: tuple[Gaussians, Tensor | None],
     clear: Clear,
     camera: Camera,
+    view: tuple[Tensor, Tensor],
+) -> _Wet:
+    """The liquids, drawn.
+
+    Args:
+        everything: All splats, the liquids' as transparent as their bodies, and their groups.
+        clear: The liquids.
+        camera: Where from.
+        view: Its matrices.
+    """
+    gaussians, groups = everything
+    size, eye = (camera.width, camera.height), -(view[0][:3, 3] @ view[0][:3, :3])
+    rows = clear.rows.nonzero()[:, 0]
+    mine = gaussians.select(rows)
+    spacing = float(clear.volume.median()) ** (1.0 / 3.0)
+    infinite = clear.attenuation.isinf()
+    opaque = bool(infinite.all())
+    front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
+    normals = surface_normals(front, plate_normals(front, eye), eye)
+    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=normals)
+    assert seen.depth is not None and seen.normal is not None  # asked for
+    if opaque:
+        body = torch.cat([seen.image, seen.alpha[..., None]], dim=2)
+    else:
+        paint = gaussians.means.new_zeros(gaussians.count, 4)
+        paint[rows] = torch.cat([mine.colors(), torch.ones_like(mine.means[:, :1])], 1).to(paint)
+        body = draw_at(gaussians, *view, size, colors=paint, near=_NEAR, groups=groups).image
+    raw = Surface(seen.alpha, seen.depth, seen.normal)
+    surface, body = closed(raw, body, spacing, camera)
+    surface = smoothed(surface, spacing, camera)
+    return _Wet(
+        surface,
+        body,
+        there=surface.alpha,
+        done=torch.zeros_like(surface.alpha, dtype=torch.bool),
+        gloss=clear.gloss.to(body),
+        opaque=opaque,
+        shadowed=bool(infinite.any()),
+        spacing=spacing,
+    )
+
+
+def _wetted(
+    behind: tuple[Tensor, Tensor, Tensor],
+    wet: _Wet,
     view: tuple[Tensor, Tensor],
     lit: Lit | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -310,53 +409,44 @@ def _wetted(
 
     Args:
         behind: The picture of all else, its opacity and depth.
-        everything: All splats, the liquids' as transparent as their bodies, and their groups.
-        clear: The liquids.
-        camera: Where from.
-        view: Its matrices.
+        wet: The liquids.
+        view: The matrices of the camera.
         lit: The light; None for none.
     """
     image, alpha, depth = behind
-    gaussians, groups = everything
-    size, eye = (camera.width, camera.height), -(view[0][:3, 3] @ view[0][:3, :3])
-    rows = clear.rows.nonzero()[:, 0]
-    mine = gaussians.select(rows)
-    spacing = float(clear.volume.median()) ** (1.0 / 3.0)
-    paint = torch.zeros_like(gaussians.means)
-    paint = torch.cat([paint, paint[:, :1]], dim=1)
-    paint[rows] = torch.cat([mine.colors(), torch.ones_like(mine.means[:, :1])], dim=1).to(paint)
-    body = draw_at(gaussians, *view, size, colors=paint, near=_NEAR, groups=groups).image
-    front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
-    normals = surface_normals(front, plate_normals(front, eye), eye)
-    seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=normals)
-    assert seen.depth is not None and seen.normal is not None  # asked for
-    surface = smoothed(Surface(seen.alpha, seen.depth, seen.normal), spacing, camera)
-    cover = covered(surface, spacing, camera)
-    there = in_front(surface._replace(alpha=cover), alpha, depth, spacing)
-    # the body ends where the surface does
-    scale = torch.minimum(cover / seen.alpha.clamp(min=1e-6), 1.0 / body[..., 3].clamp(min=1e-6))
-    body = body * scale[..., None]
-    taken, color = body[..., 3], body[..., :3]
+    surface, there = wet.surface, wet.there
+    cover = surface.alpha
+    # what hides an opaque body hides its surface, of a clear one its splats in their order
+    scale = there if wet.opaque else torch.minimum(cover, 1.0 / wet.body[..., 3].clamp(min=1e-6))
+    body = (wet.body * scale[..., None]).masked_fill(wet.done[..., None], 0.0)
+    taken, color, shine = body[..., 3], body[..., :3], None
     if lit is not None:
-        # nothing hides the surroundings of what lets light through: no matter stands on a liquid
-        opaque = bool(clear.attenuation.isinf().any())
         none = torch.zeros_like(image[0, 0])
+        gloss = wet.gloss if wet.opaque else _constant((0.0, 1.0), image.dtype, image.device)
         planes = (color, taken, surface.depth, surface.normal)
-        dull = _constant((0.0, 1.0), image.dtype, image.device)
-        color = _shaded(planes, dull, view, lit if opaque else _open(lit), none, None)
-    shown = to_linear(image * (1.0 - taken[..., None]) + color)
+        # nothing hides the surroundings of what lets light through: no matter stands on a liquid
+        color = _shaded(planes, gloss, view, lit if wet.shadowed else _open(lit), none, None)
+        if not wet.opaque:
+            anywhere = (there > 0.0).to(alpha)
+            planes = (torch.zeros_like(image), anywhere, surface.depth, surface.normal)
+            shine = _shaded(planes, wet.gloss, view, _open(lit), none, None)
+    # most of a picture is dry
+    pixels = ((there > 0.0) | (taken > 0.0)).flatten().nonzero()[:, 0]
+    old, left, add = (plane.flatten(0, 1)[pixels] for plane in (image, 1.0 - taken, color))
+    shown = to_linear(old * left[:, None] + add)
     if lit is not None:
-        anywhere = (there > 0.0).to(alpha)
-        planes = (torch.zeros_like(image), anywhere, surface.depth, surface.normal)
-        shine = _shaded(planes, clear.gloss.to(image), view, _open(lit), none, None)
-        _, rays = surface_points(surface.depth, *view)
-        share, toward = mirrored(surface.normal, rays)
-        mirror = ceiling(toward)[..., None] + irradiance(lit.environment, toward)
-        share = (share * there)[..., None]
-        shown = shown * (1.0 - share) + share * mirror + there[..., None] * to_linear(shine)
+        share, toward = mirrored(
+            surface.normal.flatten(0, 1)[pixels], pixel_rays(pixels, image.shape[1], *view)
+        )
+        share = (share * there.flatten()[pixels])[:, None]
+        mirror = ceiling(toward)[:, None] + irradiance(lit.environment, toward)
+        shown = shown * (1.0 - share) + share * mirror
+        if shine is not None:
+            shown = shown + (there[..., None] * to_linear(shine)).flatten(0, 1)[pixels]
+    shown = to_display(shown).clamp(0.0, 1.0).to(image)
     nearer = (cover > 0.5) & ((surface.depth < depth) | (alpha < 0.5))
     return (
-        to_display(shown).clamp(0.0, 1.0),
+        image.flatten(0, 1).index_copy(0, pixels, shown).view_as(image),
         1.0 - (1.0 - alpha) * (1.0 - cover),
         torch.where(nearer, surface.depth, depth),
     )

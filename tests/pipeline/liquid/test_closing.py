@@ -1,0 +1,147 @@
+"""Gaps between the points of a liquid are closed in its picture, and its rims are smooth; drops,
+strands and what is apart in depth stay as they are. Its light is asked for once."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsfluent import ops
+from gsfluent.data import Camera, Gaussians
+from gsfluent.pipeline.light.lamps import studio_light
+from gsfluent.pipeline.liquid.clear import Clear, Surface
+from gsfluent.pipeline.liquid.closing import closed
+from gsfluent.pipeline.render.stage import Render
+
+H = 0.004
+SIZE = 160
+PIXELS = 0.5 * SIZE / math.tan(math.radians(2.0)) * H / 2.0
+"""A spacing of the points [px]."""
+ROW, COLUMN = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+
+
+def camera() -> Camera:
+    """Looks down on the origin from 2 m."""
+    return Camera.look_at((0.0, -1e-3, 2.0), (0.0, 0.0, 0.0), width=SIZE, height=SIZE, fov=4.0)
+
+
+def disc(x: float, y: float, radius: float | Tensor) -> Tensor:
+    """Opacity of a disc with an edge of a pixel, [H, W]."""
+    far = ((COLUMN - x) ** 2 + (ROW - y) ** 2).sqrt()
+    return (radius - far + 0.5).clamp(0.0, 1.0)
+
+
+def seen(alpha: Tensor, depth: Tensor | None = None) -> Tensor:
+    """Opacity of a liquid whose splats have this one."""
+    depth = torch.full_like(alpha, 2.0) if depth is None else depth
+    normal = torch.tensor([0.0, 0.0, 1.0]) * alpha[..., None]
+    paint = alpha[..., None] * torch.tensor([0.8, 0.7, 0.6])
+    made, unit = closed(Surface(0.97 * alpha, depth, normal), 0.97 * paint, H, camera())
+    wet = made.alpha > 0.01
+    assert torch.allclose(unit[wet], torch.tensor([0.8, 0.7, 0.6]), atol=2e-3)
+    assert torch.allclose(made.depth[wet & (depth == 2.0)], torch.tensor(2.0), atol=1e-4) or (
+        depth.unique().numel() > 1
+    )
+    return made.alpha
+
+
+def test_a_pinhole_is_closed_and_a_hole_is_not() -> None:
+    whole = disc(80, 80, 60)
+    assert float(seen(whole - disc(80, 80, PIXELS))[60:100, 60:100].min()) > 0.999
+    open_ = seen(whole - disc(80, 80, 4.0 * PIXELS))
+    assert float(open_[80, 80]) < 0.01
+    # its edge is hardly nearer: sigma^2 / 2 R
+    across = open_[80, 80:120]
+    assert float((1.0 - across).sum()) == pytest.approx(4.0 * PIXELS, abs=0.3 * PIXELS)
+
+
+def test_a_rim_of_scallops_is_smooth() -> None:
+    angle = torch.atan2(ROW - 80, COLUMN - 80)
+    rough = disc(80, 80, 60 + 0.7 * PIXELS * torch.cos(24 * angle))
+
+    def ripple(alpha: Tensor) -> float:
+        return float((alpha * torch.cos(24 * angle)).sum())
+
+    assert ripple(seen(rough)) < 0.2 * ripple(rough)
+
+
+def test_straight_edges_drops_and_strands_stay() -> None:
+    half = (COLUMN < 80).float()
+    edge = seen(half)[80]
+    assert float(edge.sum()) == pytest.approx(80.0, abs=0.5)
+    drop = disc(130, 80, 0.6 * PIXELS)
+    beside = seen((half + drop).clamp(max=1.0))
+    assert float(beside[:, 110:].sum()) == pytest.approx(float(seen(drop)[:, 110:].sum()), rel=0.05)
+    assert float(seen(drop).max()) > 0.95
+    strand = ((ROW - 80).abs() < 0.6 * PIXELS).float()
+    assert float(seen(strand)[80].min()) > 0.95
+
+
+def test_a_gap_between_two_sheets_stays() -> None:
+    """A curtain before a pool: what is between them is seen."""
+    gap = 0.7 * PIXELS
+    alpha = ((COLUMN - 80).abs() > gap).float()
+    flat = seen(alpha)
+    apart = seen(alpha, torch.where(COLUMN < 80, 1.9, 2.1))
+    assert float(flat[80].min()) > 0.99
+    assert float(apart[80, 80]) < 0.1
+
+
+def test_nothing_to_be_seen_stays_nothing() -> None:
+    empty = Surface(torch.zeros(8, 8), torch.zeros(8, 8), torch.zeros(8, 8, 3))
+    made, paint = closed(empty, torch.zeros(8, 8, 4), H, camera())
+    assert made is empty
+    assert not bool(paint.any())
+
+
+def plate(side: float, z: float, color: tuple[float, float, float], step: float) -> Gaussians:
+    line = torch.arange(-side, side + 1e-9, step)
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    means = torch.stack([x, y, torch.full_like(x, z)], -1).reshape(-1, 3)
+    paint = means.new_tensor(color).expand_as(means).contiguous()
+    return Gaussians.from_colors(
+        means, torch.full((len(means),), 0.6 * step), paint, opacities=0.95
+    )
+
+
+def poured(gap: float, wide: float = 0.04) -> tuple[Gaussians, Clear]:
+    """A film of milk that lacks the points within ``gap`` of its middle, over a red plate."""
+    milk = plate(wide, 0.0, (0.9, 0.9, 0.85), H)
+    milk = milk.select((milk.means.norm(dim=1) >= gap).nonzero()[:, 0])
+    whole = Gaussians.cat([milk, plate(0.08, -0.03, (0.8, 0.1, 0.1), 0.002)])
+    volume = torch.full((milk.count,), H**3)
+    rows = torch.arange(whole.count) < milk.count
+    return whole, Clear(rows, volume, torch.full_like(volume, math.inf), torch.tensor([0.5, 60.0]))
+
+
+def test_no_red_shows_through_a_film_of_milk_that_lacks_a_point() -> None:
+    torn, clear = poured(0.9 * H)
+    made = Render(camera(), studio_light())(torn, clear=clear)
+    whole = Render(camera(), studio_light())(*poured(0.0)[:1], clear=poured(0.0)[1])
+    middle = slice(70, 90)
+    assert float((made.image - whole.image)[middle, middle].abs().max()) < 0.03
+    assert float(made.alpha[middle, middle].min()) > 0.999
+    far, clear = poured(6.0 * H)
+    assert float(Render(camera(), studio_light())(far, clear=clear).image[80, 80, 1]) < 0.3
+
+
+def test_what_milk_hides_is_not_lit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Light is what a picture of milk costs: hardly a pixel may be asked for twice."""
+    lit = 0
+
+    def counted(image: Tensor, alpha: Tensor, *rest: Tensor, **options: object) -> Tensor:
+        nonlocal lit
+        lit += int((alpha > 1e-4).sum())
+        return shade(image, alpha, *rest, **options)  # type: ignore[arg-type]
+
+    shade = ops.shade
+    monkeypatch.setattr(ops, "shade", counted)
+    whole, clear = poured(0.0)
+    stage = Render(camera(), studio_light())
+    stage(whole, clear=clear)
+    wet, lit = lit, 0
+    stage(whole)
+    assert wet < 1.25 * lit
