@@ -12,6 +12,6 @@ __getattr__, __dir__, __all__ = room(
     lamps="Lamp Lighting SHININESS SOFTNESS SPECULAR pack_lamps",
     normals="Grid grid_for occupancy_cell plate_normals splat_normals",
     occlusion="Occupancy",
-    shade="arriving irradiance surface_points to_display to_linear",
+    shade="arriving irradiance pixel_rays surface_points to_display to_linear",
     shadow_maps="Bulk Lit bulk faces_of shadow_maps",
 )
