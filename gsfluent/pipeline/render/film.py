@@ -22,6 +22,7 @@ from gsfluent.pipeline.light.from_shot import clear_of, gloss_of, plates_of, tra
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
+from gsfluent.pipeline.liquid.wetness import Wetness, wet_colors, wet_gloss
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
 from gsfluent.pipeline.render.camera import Action, cameras_for
 from gsfluent.pipeline.render.figures import cameras_around
@@ -84,6 +85,7 @@ class Film:
         share = 0.0 if self.render.light is None else self.render.light.delight
         self._albedo = Albedo(self.frame(0), share) if share > 0.0 else None
         self._room: Room | None = None
+        self._wetness = Wetness(self.frame, clear_of)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -114,9 +116,12 @@ class Film:
     def drawn(self, gaussians: Gaussians, frame: SavedFrame, camera: Camera) -> Picture:
         """The picture of splats at the moment of a frame, in any camera."""
         gloss, clear = gloss_of(self.shot, frame), transmission_of(self.shot, frame)
-        shown = gaussians
+        shown, wet = gaussians, self._wetness.at(frame)
+        if wet is not None:
+            shown = wet_colors(shown, wet)
+            gloss = None if gloss is None else wet_gloss(gloss, wet)
         if clear is not None:
-            shown, gloss = as_seen(gaussians, gloss, clear, camera)
+            shown, gloss = as_seen(shown, gloss, clear, camera)
         made = self.render(
             shown,
             camera,
@@ -128,6 +133,7 @@ class Film:
             time=frame.time,
             room=self._room,
             clear=clear_of(frame),
+            wet=wet,
         )
         if clear is not None:
             # what is seen through glass is no hole in it

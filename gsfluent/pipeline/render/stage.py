@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsfluent import ops
 from gsfluent.data import Camera, Gaussians
@@ -140,6 +141,7 @@ class Render(Stage):
         time: float = 0.0,
         room: Room | None = None,
         clear: Clear | None = None,
+        wet: Tensor | None = None,
     ) -> Picture:
         """Render one picture.
 
@@ -159,6 +161,7 @@ class Render(Stage):
                 occlusion stays what it was while the matter fits.
             clear: The splats that are a liquid: drawn as its body and its surface, the same
                 in ``alpha`` as if they were opaque. None draws them as all others.
+            wet: How much of a film of water each splat has, which mirrors, [N]; None for none.
 
         Raises:
             InputError: No camera, or a camera with lens distortion.
@@ -169,17 +172,18 @@ class Render(Stage):
         eye = -(view[0][:3, 3] @ view[0][:3, :3])
         lighting = None if self.light is None else self.light.at(time)
         everything, dense = (gaussians, groups), gaussians
-        wet = None
+        liquid = None
         if clear is not None and bool(clear.rows.any()):
             everything = (_as_body(gaussians, clear, eye), groups)
             through = clear.rows.masked_scatter(clear.rows, clear.attenuation.isfinite())
             if not bool(through.all()):
                 dense = gaussians.select((~through).nonzero()[:, 0])
-            wet = _liquid(everything, clear, camera, view)
+            liquid = _liquid(everything, clear, camera, view)
             rest = (~clear.rows).nonzero()[:, 0]
             gaussians = gaussians.select(rest)
-            groups, gloss, plates, rigid = (
-                None if value is None else value[rest] for value in (groups, gloss, plates, rigid)
+            groups, gloss, plates, rigid, wet = (
+                None if value is None else value[rest]
+                for value in (groups, gloss, plates, rigid, wet)
             )
         lit, extras = None, None
         if lighting is not None:
@@ -190,6 +194,8 @@ class Render(Stage):
                 extras = extras.index_copy(0, flat, plate_normals(gaussians.select(flat), eye))
             if gloss is not None and (lighting.specular is None or lighting.shininess is None):
                 extras = torch.cat([extras, gloss.to(extras)], 1)
+            if wet is not None:
+                extras = torch.cat([extras, wet[:, None].to(extras)], 1)
         layers: list[Tensor | None] = [None]
         if rigid is not None and bool(rigid.any()):
             layers = [(~rigid).nonzero()[:, 0], rigid.nonzero()[:, 0]]
@@ -212,16 +218,23 @@ class Render(Stage):
         image, alpha, depth = seen.image, seen.alpha, seen.depth
         behind = _constant(self.background, means.dtype, means.device)
         whole = lit is not None and backdrop is None  # object, floor and backdrop at once
-        if wet is not None:
-            wet = wet.before(alpha, depth)
+        if liquid is not None:
+            liquid = liquid.before(alpha, depth)
         if lit is not None and lighting is not None and seen.normal is not None:
-            vectors, gloss = _gloss(lighting, seen.normal, alpha)
+            given, film = seen.normal, None
+            if wet is not None:
+                given, film = given[..., :-1].contiguous(), given[..., -1]
+            vectors, gloss = _gloss(lighting, given, alpha)
             planes = (image, alpha, depth, vectors)
-            if wet is not None and wet.opaque and whole:
-                wet, planes, gloss = wet.shaded_with(planes, gloss)
+            if liquid is not None and liquid.opaque and whole:
+                liquid, planes, gloss = liquid.shaded_with(planes, gloss)
             ground = behind if whole else torch.zeros_like(behind)
             floor = self.studio if whole else None
             image = _shaded(planes, gloss, view, lit, ground, floor)
+            if film is not None:
+                # under water there is no surface on it
+                bare = film if liquid is None else film * (1.0 - liquid.there)
+                image = _glazed(image, bare, vectors, view, lit)
         if not whole:
             if self.studio is not None:
                 light = _plain_light(image) if lit is None else lit
@@ -244,8 +257,8 @@ class Render(Stage):
                 before = (opaque > 0.5) & (away < depth)[..., None] & (cover > 0.0)
                 image = torch.where(before, captured + image * (1.0 - opaque), image)
             image = image.clamp(0.0, 1.0)
-        if wet is not None:
-            image, alpha, depth = _wetted((image, alpha, depth), wet, view, lit)
+        if liquid is not None:
+            image, alpha, depth = _wetted((image, alpha, depth), liquid, view, lit)
         report = {
             "gaussians": everything[0].count,
             "lamps": 0 if lit is None else len(lit.lamps),
@@ -304,7 +317,7 @@ def _as_body(gaussians: Gaussians, clear: Clear, eye: Tensor) -> Gaussians:
 
 
 @dataclass(frozen=True)
-class _Wet:
+class _Liquid:
     """The liquids of a picture.
 
     Attributes:
@@ -327,13 +340,13 @@ class _Wet:
     shadowed: bool
     spacing: float
 
-    def before(self, alpha: Tensor, depth: Tensor) -> _Wet:
+    def before(self, alpha: Tensor, depth: Tensor) -> _Liquid:
         """With what other things, their opacity and depth [H, W], leave to be seen."""
         return replace(self, there=in_front(self.surface, alpha, depth, self.spacing))
 
     def shaded_with(
         self, planes: tuple[Tensor, Tensor, Tensor, Tensor], gloss: Tensor | None
-    ) -> tuple[_Wet, tuple[Tensor, Tensor, Tensor, Tensor], Tensor | None]:
+    ) -> tuple[_Liquid, tuple[Tensor, Tensor, Tensor, Tensor], Tensor | None]:
         """The planes of all else, and its gloss, with the liquid where it hides all else.
 
         What is behind it needs no light, and the liquid none of its own.
@@ -358,7 +371,7 @@ def _liquid(
     clear: Clear,
     camera: Camera,
     view: tuple[Tensor, Tensor],
-) -> _Wet:
+) -> _Liquid:
     """The liquids, drawn.
 
     Args:
@@ -387,7 +400,7 @@ def _liquid(
     raw = Surface(seen.alpha, seen.depth, seen.normal)
     surface, body = closed(raw, body, spacing, camera)
     surface = smoothed(surface, spacing, camera)
-    return _Wet(
+    return _Liquid(
         surface,
         body,
         there=surface.alpha,
@@ -399,9 +412,26 @@ def _liquid(
     )
 
 
+def _glazed(
+    image: Tensor, film: Tensor, normal: Tensor, view: tuple[Tensor, Tensor], lit: Lit
+) -> Tensor:
+    """The picture with what a film of water mirrors, ``film`` [H, W] of it in every pixel."""
+    pixels = (film > 1e-3).flatten().nonzero()[:, 0]
+    toward = normalize(normal[..., :3].flatten(0, 1)[pixels], dim=1)
+    rays = pixel_rays(pixels, image.shape[1], *view)
+    share, toward = mirrored(toward, rays)
+    share = (share * film.flatten()[pixels])[:, None]
+    # what stands low mirrors what it stands on, mostly itself in the shade
+    open_ = 0.5 * (1.0 + toward[:, 2:])
+    mirror = ceiling(toward)[:, None] + open_ * irradiance(lit.environment, toward)
+    shown = to_linear(image.flatten(0, 1)[pixels])
+    shown = to_display(shown * (1.0 - share) + share * mirror).clamp(0.0, 1.0)
+    return image.flatten(0, 1).index_copy(0, pixels, shown.to(image)).view_as(image)
+
+
 def _wetted(
     behind: tuple[Tensor, Tensor, Tensor],
-    wet: _Wet,
+    liquid: _Liquid,
     view: tuple[Tensor, Tensor],
     lit: Lit | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -409,27 +439,29 @@ def _wetted(
 
     Args:
         behind: The picture of all else, its opacity and depth.
-        wet: The liquids.
+        liquid: The liquids.
         view: The matrices of the camera.
         lit: The light; None for none.
     """
     image, alpha, depth = behind
-    surface, there = wet.surface, wet.there
+    surface, there = liquid.surface, liquid.there
     cover = surface.alpha
     # what hides an opaque body hides its surface, of a clear one its splats in their order
-    scale = there if wet.opaque else torch.minimum(cover, 1.0 / wet.body[..., 3].clamp(min=1e-6))
-    body = (wet.body * scale[..., None]).masked_fill(wet.done[..., None], 0.0)
+    scale = (
+        there if liquid.opaque else torch.minimum(cover, 1.0 / liquid.body[..., 3].clamp(min=1e-6))
+    )
+    body = (liquid.body * scale[..., None]).masked_fill(liquid.done[..., None], 0.0)
     taken, color, shine = body[..., 3], body[..., :3], None
     if lit is not None:
         none = torch.zeros_like(image[0, 0])
-        gloss = wet.gloss if wet.opaque else _constant((0.0, 1.0), image.dtype, image.device)
+        gloss = liquid.gloss if liquid.opaque else _constant((0.0, 1.0), image.dtype, image.device)
         planes = (color, taken, surface.depth, surface.normal)
         # nothing hides the surroundings of what lets light through: no matter stands on a liquid
-        color = _shaded(planes, gloss, view, lit if wet.shadowed else _open(lit), none, None)
-        if not wet.opaque:
+        color = _shaded(planes, gloss, view, lit if liquid.shadowed else _open(lit), none, None)
+        if not liquid.opaque:
             anywhere = (there > 0.0).to(alpha)
             planes = (torch.zeros_like(image), anywhere, surface.depth, surface.normal)
-            shine = _shaded(planes, wet.gloss, view, _open(lit), none, None)
+            shine = _shaded(planes, liquid.gloss, view, _open(lit), none, None)
     # most of a picture is dry
     pixels = ((there > 0.0) | (taken > 0.0)).flatten().nonzero()[:, 0]
     old, left, add = (plane.flatten(0, 1)[pixels] for plane in (image, 1.0 - taken, color))
