@@ -14,4 +14,5 @@ __getattr__, __dir__, __all__ = room(
     occlusion="Occupancy",
     shade="arriving irradiance pixel_rays surface_points to_display to_linear",
     shadow_maps="Bulk Lit bulk faces_of shadow_maps",
+    wetness="Wetness wet_colors wet_gloss",
 )

@@ -4,12 +4,10 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    clear="OPACITY Clear Surface body_opacities ceiling covered in_front mirrored smoothed "
-    "span surface_normals",
+    clear="OPACITY Clear Surface body_opacities ceiling in_front mirrored smoothed surface_normals",
     closing="closed",
     looks="Liquids",
     nozzle="WAITING pours",
     parts="LiquidParts",
     sheet="CLOSED ellipsoids",
-    wetness="Wetness wet_colors wet_gloss",
 )

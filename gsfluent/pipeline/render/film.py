@@ -22,7 +22,7 @@ from gsfluent.pipeline.light.from_shot import clear_of, gloss_of, plates_of, tra
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
-from gsfluent.pipeline.liquid.wetness import Wetness, wet_colors, wet_gloss
+from gsfluent.pipeline.light.wetness import Wetness, wet_colors, wet_gloss
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
 from gsfluent.pipeline.render.camera import Action, cameras_for
 from gsfluent.pipeline.render.figures import cameras_around

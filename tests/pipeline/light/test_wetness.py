@@ -11,7 +11,7 @@ import torch
 from gsfluent.data import Camera, Gaussians
 from gsfluent.pipeline.light.from_shot import clear_of
 from gsfluent.pipeline.light.lamps import studio_light
-from gsfluent.pipeline.liquid.wetness import (
+from gsfluent.pipeline.light.wetness import (
     DRIES,
     INTERNAL,
     TOUCH,
