@@ -26,6 +26,8 @@ SOFT = 0.75
 """Half of the width of a closed edge [px]."""
 UNSURE = (0.25, 0.75)
 """Opacity of the splats up to which a pixel is what is around, and from which on it is its own."""
+FACING = (0.2, 0.5)
+"""Length of a blended normal up to which it says nothing, and from which on it is believed."""
 INSIDE = (0.7, 0.9)
 """Share of liquid around a pixel from which on it is a sheet's inside, and where it surely is."""
 RIM = 2.5
@@ -68,7 +70,11 @@ def closed(
     around = _blurred(planes.permute(2, 0, 1), sigma).permute(1, 2, 0)
     much, mean = around[..., 0], around[..., 1:] / around[..., :1].clamp(min=_LEAST)
     # in a gap there is what is around it
-    mixed = torch.lerp(mean, own, _ramp(alpha, UNSURE)[..., None])
+    sure = _ramp(alpha, UNSURE)
+    mixed = torch.lerp(mean, own, sure[..., None])
+    # and where near and far side of an outline have cancelled each other, what faces as those do
+    facing = torch.minimum(sure, _ramp(surface.normal[window].norm(dim=2), FACING))
+    normal = torch.lerp(mean[..., 2:5], own[..., 2:5], facing[..., None])
     # a straight edge, blurred, is as steep as 1 / (sigma sqrt(2 pi))
     soft = min(SOFT / (math.sqrt(2.0 * math.pi) * sigma), 0.45)
     full = _ramp(much, (0.5 - soft, 0.5 + soft))
@@ -82,7 +88,7 @@ def closed(
     made = Surface(
         _put(surface.alpha, cover, window),
         _put(surface.depth, mixed[..., 0] * spacing + middle, window),
-        _put(surface.normal, mixed[..., 2:5], window),
+        _put(surface.normal, normal, window),
     )
     return made, _put(unit, mixed[..., 5:], window)
 

@@ -90,6 +90,17 @@ def test_a_gap_between_two_sheets_stays() -> None:
     assert float(apart[80, 80]) < 0.1
 
 
+def test_an_outline_faces_as_what_is_beside_it() -> None:
+    """Splats of the near and the far side cancelled each other there: specks in the dark."""
+    alpha, depth = (COLUMN < 80).float(), torch.full((SIZE, SIZE), 2.0)
+    normal = torch.tensor([0.0, -0.6, 0.8]).repeat(SIZE, SIZE, 1) * alpha[..., None]
+    normal[70:90:3, 79] = torch.tensor([0.1, 0.05, -0.1])
+    depth[70:90:3, 79] += 5.0 * H
+    made, _ = closed(Surface(0.97 * alpha, depth, normal), alpha[..., None], H, camera())
+    face = torch.nn.functional.normalize(made.normal[70:90, 79], dim=1)
+    assert float((face @ torch.tensor([0.0, -0.6, 0.8])).min()) > 0.99
+
+
 def test_nothing_to_be_seen_stays_nothing() -> None:
     empty = Surface(torch.zeros(8, 8), torch.zeros(8, 8), torch.zeros(8, 8, 3))
     made, paint = closed(empty, torch.zeros(8, 8, 4), H, camera())
