@@ -10,8 +10,11 @@ import torch
 from viewer_scene import FRAMES, HEIGHT, RADIUS, SIGMA, SPEED, frame, write_run
 
 from gsfluent import geometry
-from gsfluent.data import Camera
+from gsfluent.data import Camera, Gaussians
+from gsfluent.pipeline.light.from_shot import clear_of
 from gsfluent.pipeline.light.lamps import key_light
+from gsfluent.pipeline.light.wetness import Wetness
+from gsfluent.pipeline.render.stage import Picture, Render
 from gsfluent.viewer.draw.picture import PictureMaker, browser_camera, hidden
 from gsfluent.viewer.draw.splats import unit_size
 from gsfluent.viewer.model import look
@@ -164,6 +167,42 @@ def test_splats_without_matter_are_grey_and_unknown_colours_refused(maker: Pictu
     assert float((colors[7:] - colors[0]).abs().amax(1).min()) > 0.1
     with pytest.raises(ValueError, match="color_by"):
         splat_colors(moment, maker.timeline, "Taste")
+
+
+def test_liquids_rigid_things_and_wet_skin_are_drawn_as_in_the_film(
+    maker: PictureMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the film hands to the picture stage the viewer does, too, and cuts it with the rest."""
+    moment = frame(1)
+    count = moment.gaussians.count
+    # a hundred splats of the skin are water, seven a blade's
+    moment.ids[:100] = -1 - torch.arange(100)
+    moment.anchor[100:107] = -1
+    moment.body[moment.anchor[:100].long()] = 1
+    moment.facts["bodies"] = [["ball", "wood"], ["pool", "water"]]
+    monkeypatch.setattr(maker.timeline, "frame", lambda index: moment)
+    monkeypatch.setattr(maker, "_wetness", Wetness(lambda index: moment, clear_of))
+    asked: dict[str, torch.Tensor] = {}
+
+    def seen(self: Render, gaussians: Gaussians, camera: Camera, **given: object) -> Picture:
+        asked.update(given)  # type: ignore[arg-type]
+        return drawn(self, gaussians, camera, **given)  # type: ignore[arg-type]
+
+    drawn = Render.forward
+    monkeypatch.setattr(Render, "forward", seen)
+    maker.picture(1, front(32, 24), Look())
+    assert asked["rigid"].nonzero()[:, 0].tolist() == list(range(100, 107))
+    liquid = asked["clear"]
+    assert torch.equal(liquid.rows, clear_of(moment).rows) and bool(liquid.rows[:100].any())
+    assert 0.0 < float(asked["wet"].mean()) < 0.5
+    # colours that tell something are not looked through
+    maker.picture(1, front(32, 24), Look(look.MATERIAL))
+    assert asked["clear"] is None and asked["wet"] is None
+    kept = maker.splats(moment, Look(cut=Cut((0.0, -1.0, 0.0), 0.0)))
+    rows = kept.gaussians.count
+    assert kept.liquid is not None and kept.wet is not None and rows < count
+    assert kept.liquid.rows.shape == kept.wet.shape == kept.rigid.shape == (rows,)
+    assert kept.liquid.volume.shape[0] == int(kept.liquid.rows.sum()) < 100
 
 
 @pytest.mark.parametrize("name", COLOR_BY)

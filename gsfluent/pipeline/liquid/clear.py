@@ -61,6 +61,11 @@ class Clear(NamedTuple):
     attenuation: Tensor
     gloss: Tensor
 
+    def select(self, kept: Tensor) -> Clear:
+        """Those among splats of which some, bool [N], are kept."""
+        mine = kept[self.rows]
+        return Clear(self.rows[kept], self.volume[mine], self.attenuation[mine], self.gloss)
+
 
 class Surface(NamedTuple):
     """The surface of a liquid in a picture.

@@ -23,10 +23,11 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
 from gsfluent.ops.raster import Rendered
 from gsfluent.pipeline.light.from_shot import clear_of
-from gsfluent.pipeline.liquid.clear import OPACITY
+from gsfluent.pipeline.liquid.clear import OPACITY, Clear
 from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.render.flicker import Flow, flicker
 from gsfluent.pipeline.render.holes import Holes, MatterView, small
+from gsfluent.pipeline.render.stage import Picture, Render
 from gsfluent.results.frames import SavedFrame
 from gsfluent.spatial.neighbours import nearest_in_group
 
@@ -116,6 +117,8 @@ class FilmFigures:
     ) -> None:
         self._first, self._around, self._every = first, list(around), every
         self._spacing = spacing_of(first)
+        # as the film, without its light
+        self._render = Render()
         self._last: _Last | None = None
         self._broken = 0
         self._values: dict[str, list[float | int | None]] = {
@@ -139,7 +142,7 @@ class FilmFigures:
             depth: Their expected depth there [m], [H, W].
         """
         index = len(self._values["flicker"])
-        frame, view = _solid(frame), small(camera)
+        view, clear = small(camera), clear_of(frame)
         places = frame.shown
         matter = MatterView.of(places, frame.volumes, view)
         film = Holes.of(alpha, depth, matter)
@@ -155,20 +158,28 @@ class FilmFigures:
         if turn not in (1 % self._every, 2 % self._every):
             self._enter("", [None, film])
             return
-        shown = [
-            (self._raw.at(frame), None),
-            (_plain(frame.gaussians), frame.groups if added else None),
-        ]
-        drawn = [_drawn(splats, view, groups) for splats, groups in shown]
-        self._enter("", [_holes(drawn[0], _bare(frame, matter, view)), film])
-        images = [picture.image for picture in drawn]
+        raw, plain = self._raw.at(_solid(frame, clear)), _plain(frame.gaussians)
+
+        def drawn(view: Camera) -> list[Rendered | Picture]:
+            shown = self._render(
+                plain,
+                view,
+                groups=frame.groups if added else None,
+                rigid=frame.anchor < 0,
+                clear=clear,
+            )
+            return [_drawn(raw, view), shown]
+
+        pictures = drawn(view)
+        self._enter("", [_holes(pictures[0], _bare(frame, matter, view)), film])
+        images = [picture.image for picture in pictures]
         self._enter_flicker(_Last(index, matter, view, places, images))
         if self._around:
             view = self._around[index % len(self._around)]
             matter = MatterView.of(places, frame.volumes, view)
-            drawn = [_drawn(splats, view, groups) for splats, groups in shown]
-            before = _holes(drawn[0], _bare(frame, matter, view))
-            self._enter("_around", [before, _holes(drawn[1], matter)])
+            pictures = drawn(view)
+            before = _holes(pictures[0], _bare(frame, matter, view))
+            self._enter("_around", [before, _holes(pictures[1], matter)])
 
     def _set(self, name: str, value: float | int | None) -> None:
         self._values[name][-1] = round(value, 6) if isinstance(value, float) else value
@@ -203,21 +214,20 @@ def _bare(frame: SavedFrame, shown: MatterView, view: Camera) -> MatterView:
     return shown if frame.led is None else MatterView.of(frame.positions, frame.volumes, view)
 
 
-def _solid(frame: SavedFrame) -> SavedFrame:
+def _solid(frame: SavedFrame, clear: Clear | None) -> SavedFrame:
     """The frame with its clear liquids opaque: what is seen through water is no hole in it."""
-    clear = clear_of(frame)
     if clear is None:
         return frame
     opaque = torch.where(clear.rows, OPACITY, frame.gaussians.opacities)
     return replace(frame, gaussians=frame.gaussians.replace(opacities=opaque))
 
 
-def _drawn(gaussians: Gaussians, camera: Camera, groups: Tensor | None) -> Rendered:
+def _drawn(gaussians: Gaussians, camera: Camera) -> Rendered:
     white = gaussians.means.new_ones(3)
-    return draw(gaussians, camera, groups=groups, near=0.01, depth=True, background=white)
+    return draw(gaussians, camera, near=0.01, depth=True, background=white)
 
 
-def _holes(drawn: Rendered, matter: MatterView) -> Holes:
+def _holes(drawn: Rendered | Picture, matter: MatterView) -> Holes:
     assert drawn.depth is not None  # asked for; narrows the type
     return Holes.of(drawn.alpha, drawn.depth, matter)
 

@@ -197,7 +197,7 @@ class Render(Stage):
             if wet is not None:
                 extras = torch.cat([extras, wet[:, None].to(extras)], 1)
         layers: list[Tensor | None] = [None]
-        if rigid is not None and bool(rigid.any()):
+        if rigid is not None and bool(rigid.any()) and not bool(rigid.all()):
             layers = [(~rigid).nonzero()[:, 0], rigid.nonzero()[:, 0]]
         seen, *others = (
             draw_at(

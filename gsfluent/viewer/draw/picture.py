@@ -13,9 +13,17 @@ from torch import Tensor
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.errors import GsfluentError
-from gsfluent.pipeline.light.from_shot import gloss_of, light_of, plates_of, transmission_of
+from gsfluent.pipeline.light.from_shot import (
+    clear_of,
+    gloss_of,
+    light_of,
+    plates_of,
+    transmission_of,
+)
 from gsfluent.pipeline.light.glass import as_seen
 from gsfluent.pipeline.light.lamps import Lighting
+from gsfluent.pipeline.light.wetness import Wetness, wet_colors, wet_gloss
+from gsfluent.pipeline.liquid.clear import Clear
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.camera import FARTHEST, Action, orbit
 from gsfluent.pipeline.render.film import captured_backdrop, studio_is_dark
@@ -40,6 +48,9 @@ class Drawn:
     gloss: Tensor | None  # Highlights of each splat, [N, 2], or None
     plates: Tensor  # Splats of rigid things, bool [N]
     clear: Tensor | None  # Share of light that goes through, [N], or None
+    rigid: Tensor  # Splats of rigid things, which are set into the picture by depth, bool [N]
+    liquid: Clear | None  # Which are liquids, or None
+    wet: Tensor | None  # How wet they are, [N], or None
     legend: Legend | None  # What the colours mean, or None
 
 
@@ -52,6 +63,7 @@ class PictureMaker:
         self.shot = timeline.source.shot
         self.floor = None if self.shot is not None and self.shot.floor == "none" else 0.0
         self._backdrop = self._captured()
+        self._wetness = Wetness(timeline.frame, clear_of)
         self._dark: bool | None = None  # of the studio; known with the first picture
 
     def first_light(self) -> Lighting:
@@ -103,10 +115,13 @@ class PictureMaker:
         gaussians, gloss, time = drawn.gaussians, drawn.gloss, frame.time
         groups: Tensor | None = drawn.groups
         plates: Tensor | None = drawn.plates
+        rigid: Tensor | None = drawn.rigid
+        liquid, wet = drawn.liquid, drawn.wet
         if gaussians.count == 0:  # everything is cut away: one splat that nobody sees
             speck = frame.gaussians.select(torch.zeros(1, dtype=torch.int64, device=self.device))
             gaussians = speck.replace(opacities=torch.full_like(speck.opacities, 1e-6))
             groups, gloss, plates, time = None, None, None, 0.0
+            rigid, liquid, wet = None, None, None
         elif drawn.clear is not None and look.light is not None:
             gaussians, gloss = as_seen(gaussians, gloss, drawn.clear, camera)
         render = Render(
@@ -122,8 +137,11 @@ class PictureMaker:
             groups=groups,
             gloss=gloss,
             plates=plates,
+            rigid=rigid,
             backdrop=backdrop,
             time=time,
+            clear=liquid,
+            wet=wet,
         )
         values = (made.image * 255.0).round().clamp(0, 255).to(torch.uint8)
         return values.cpu().numpy(), drawn.legend
@@ -132,18 +150,25 @@ class PictureMaker:
         """The splats of a frame as a look shows them."""
         gaussians, groups, plates = frame.gaussians, frame.groups, plates_of(frame)
         gloss = None if self.shot is None else gloss_of(self.shot, frame)
-        clear = None
+        clear, rigid, liquid, wet = None, frame.anchor < 0, None, None
         colors, legend = splat_colors(frame, self.timeline, look.color_by)
         if colors is not None:
             gaussians = gaussians.with_sh_degree(0).with_colors(colors)
-        elif self.shot is not None:  # colours that tell something are not looked through
-            clear = transmission_of(self.shot, frame)
+        else:  # colours that tell something are not looked through, and not darker where wet
+            liquid, wet = clear_of(frame), self._wetness.at(frame)
+            if self.shot is not None:
+                clear = transmission_of(self.shot, frame)
+            if wet is not None:
+                gaussians = wet_colors(gaussians, wet)
+                gloss = None if gloss is None else wet_gloss(gloss, wet)
         if look.cut is not None:
             kept = ~hidden(gaussians.means, look.cut, self.timeline.survey(frame.index).center)
             gaussians, groups, plates = gaussians.select(kept), groups[kept], plates[kept]
             gloss = None if gloss is None else gloss[kept]
             clear = None if clear is None else clear[kept]
-        return Drawn(gaussians, groups, gloss, plates, clear, legend)
+            rigid, wet = rigid[kept], None if wet is None else wet[kept]
+            liquid = None if liquid is None else liquid.select(kept)
+        return Drawn(gaussians, groups, gloss, plates, clear, rigid, liquid, wet, legend)
 
     def _studio(self) -> Studio | None:
         if self.floor is None:

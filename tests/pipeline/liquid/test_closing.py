@@ -156,3 +156,26 @@ def test_what_milk_hides_is_not_lit(monkeypatch: pytest.MonkeyPatch) -> None:
     wet, lit = lit, 0
     stage(whole)
     assert wet < 1.25 * lit
+
+
+@pytest.mark.parametrize("attenuation", [30.0, math.inf])
+def test_matter_that_is_all_liquid_is_drawn_as_one(attenuation: float) -> None:
+    """The same with a speck of something solid that is out of the picture."""
+    whole, clear = poured(0.9 * H)
+    milk = whole.select(clear.rows.nonzero()[:, 0])
+    speck = Gaussians.from_colors(
+        torch.tensor([[0.0, 0.0, -5.0]]), torch.ones(1) * 1e-3, torch.ones(1, 3), opacities=1e-3
+    )
+    lets = torch.full_like(clear.volume, attenuation)
+    alone, beside = torch.ones(milk.count, dtype=torch.bool), torch.ones(milk.count + 1).bool()
+    beside[-1] = False
+    stage = Render(camera())
+    found = stage(milk, clear=clear._replace(rows=alone, attenuation=lets))
+    wanted = stage(
+        Gaussians.cat([milk, speck]), clear=clear._replace(rows=beside, attenuation=lets)
+    )
+    torch.testing.assert_close(found.image, wanted.image, atol=2e-3, rtol=0.0)
+    assert float(found.alpha[70:90, 70:90].min()) > 0.999
+    lit = Render(camera(), studio_light())(milk, clear=clear._replace(rows=alone, attenuation=lets))
+    assert float(lit.image[70:90, 70:90].std(dim=(0, 1)).max()) < 0.02
+    assert bool(lit.image.isfinite().all())

@@ -11,10 +11,12 @@ import torch
 from gsfluent import geometry
 from gsfluent.data import Camera, Gaussians
 from gsfluent.draw import draw
+from gsfluent.pipeline.light.from_shot import clear_of
 from gsfluent.pipeline.render.camera import Action
 from gsfluent.pipeline.render.figures import FilmFigures, RawCarry, cameras_around
 from gsfluent.pipeline.render.flicker import Flow, flicker
 from gsfluent.pipeline.render.holes import REACH, RIM, Holes, MatterView
+from gsfluent.pipeline.render.stage import Render
 from gsfluent.results.frames import SavedFrame
 
 STEP = 0.01
@@ -223,6 +225,42 @@ def test_holes_are_judged_where_the_matter_is_drawn() -> None:
         figures.add(there, view, picture.alpha, picture.depth)
         found.append(figures.report()["hole_fraction"][0])
     assert found[0] is not None and found[1] is not None and 10.0 * found[1] < found[0]
+
+
+def test_figures_around_are_those_of_the_picture_that_is_shown() -> None:
+    """Milk that lacks points is closed there, and a blade set in by depth, as in the film."""
+    points = torch.cat([slab(layers=1), slab(layers=1, half=0.03, depth=-0.04)])
+    milk, plate = fine(points[:400], edge=1), fine(points[400:])
+    torn = milk.select((points[:400].norm(dim=1) > 0.8 * STEP).nonzero()[:, 0])
+    blade = Gaussians.from_colors(
+        torch.tensor([[0.05, -0.001, 0.0]]), torch.tensor([[0.01, 0.03, 0.01]]), torch.ones(1, 3)
+    )
+    whole = Gaussians.cat([torn, plate, blade])
+    anchor = torch.arange(whole.count, dtype=torch.int32)
+    anchor = torch.where(anchor < torn.count, anchor, 400)
+    anchor[-1] = -1
+    ids = torch.arange(whole.count)
+    liquid = ids < torn.count
+    frame = dataclasses.replace(
+        saved(points, whole, 1, whole.count),
+        anchor=anchor,
+        ids=torch.where(liquid | (anchor < 0), -1 - ids, ids),
+        body=(torch.arange(len(points)) >= 400).int(),
+        damage=torch.ones(len(points)),
+        facts={"bodies": [["pool", "milk"], ["plate", "wood"]]},
+    )
+    view = cameras_around(Action.of([points]))[1]
+    figures = FilmFigures(frame, [view, view], every=1)
+    nothing = torch.zeros(240, 240)
+    for _ in range(2):
+        figures.add(frame, camera(), nothing, nothing)
+    report, clear = figures.report(), clear_of(frame)
+    shown = Render()(whole, view, rigid=anchor < 0, clear=clear)
+    wanted = Holes.of(shown.alpha, shown.depth, MatterView.of(points, frame.volumes, view))
+    assert report["hole_fraction_around"][1] == pytest.approx(wanted.fraction, abs=1e-6)
+    assert report["see_through_around"][1] == pytest.approx(wanted.through, abs=1e-6)
+    # splats as they are, which the figures were of, have the hole
+    assert wanted.fraction < 0.5 * report["hole_fraction_around_before"][1]
 
 
 def test_the_figures_of_a_film_put_what_is_drawn_beside_what_is_not_repaired() -> None:
