@@ -188,6 +188,12 @@ class Render(Stage):
         lit, extras = None, None
         if lighting is not None:
             lit, room = self._light(dense, camera, lighting, everything, room)
+            if (
+                clear is not None
+                and bool(clear.rows.all())
+                and bool(clear.attenuation.isfinite().all())
+            ):
+                lit = _open(lit)  # water hides no surroundings
             extras = splat_normals(gaussians, lit.grid, eye)
             if plates is not None:
                 flat = plates.nonzero()[:, 0]

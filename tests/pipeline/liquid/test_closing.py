@@ -3,6 +3,8 @@ strands and what is apart in depth stay as they are. Its light is asked for once
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import math
 
 import pytest
@@ -15,6 +17,7 @@ from gsfluent.pipeline.light.lamps import studio_light
 from gsfluent.pipeline.liquid.clear import Clear, Surface
 from gsfluent.pipeline.liquid.closing import closed
 from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.studio import Studio
 
 H = 0.004
 SIZE = 160
@@ -78,6 +81,18 @@ def test_straight_edges_drops_and_strands_stay() -> None:
     assert float(seen(drop).max()) > 0.95
     strand = ((ROW - 80).abs() < 0.6 * PIXELS).float()
     assert float(seen(strand)[80].min()) > 0.95
+
+
+def test_a_drop_joins_a_rim_without_a_pop() -> None:
+    """From three spacings off to inside, a tenth of a spacing a step: no step is a fifth of it."""
+    half = (COLUMN < 80).float()
+    shown = []
+    for step in range(41):
+        drop = disc(80 + (3.0 - 0.1 * step) * PIXELS, 80, 0.6 * PIXELS)
+        shown.append(float(seen(torch.maximum(half, drop)).sum()))
+    area = float(drop.sum())
+    assert abs(shown[0] - shown[-1]) < 1.5 * area
+    assert max(abs(a - b) for a, b in itertools.pairwise(shown)) < 0.2 * area
 
 
 def test_a_gap_between_two_sheets_stays() -> None:
@@ -179,3 +194,20 @@ def test_matter_that_is_all_liquid_is_drawn_as_one(attenuation: float) -> None:
     lit = Render(camera(), studio_light())(milk, clear=clear._replace(rows=alone, attenuation=lets))
     assert float(lit.image[70:90, 70:90].std(dim=(0, 1)).max()) < 0.02
     assert bool(lit.image.isfinite().all())
+
+
+def test_water_alone_hides_no_surroundings() -> None:
+    """As it hides none where something solid is in the scene, too."""
+    whole, clear = poured(0.0)
+    water = whole.select(clear.rows.nonzero()[:, 0])
+    lets = torch.full_like(clear.volume, 30.0)
+    every = clear._replace(rows=torch.ones(water.count, dtype=torch.bool), attenuation=lets)
+    stage = Render(camera(), studio_light(), studio=Studio(-0.004, (0.0, 0.0), 0.04, 0.2))
+    dim = Render(
+        camera(),
+        dataclasses.replace(studio_light(), occlusion=0.0),
+        studio=Studio(-0.004, (0.0, 0.0), 0.04, 0.2),
+    )
+    assert torch.equal(stage(water, clear=every).image, dim(water, clear=every).image)
+    milk = every._replace(attenuation=torch.full_like(lets, math.inf))
+    assert not torch.equal(stage(water, clear=milk).image, dim(water, clear=milk).image)
