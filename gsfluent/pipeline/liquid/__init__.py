@@ -4,7 +4,8 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    clear="OPACITY Clear Surface body_opacities ceiling in_front mirrored smoothed surface_normals",
+    clear="OPACITY Clear Surface body_opacities ceiling in_front mirrored single smoothed "
+    "surface_normals",
     closing="closed",
     looks="Liquids",
     nozzle="WAITING pours",

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import max_pool2d, normalize
 
 from gsfluent.data import Camera, Gaussians
 from gsfluent.geometry import quaternion_to_matrix
@@ -34,6 +34,8 @@ EDGE = (0.25, 0.75)
 """Opacity of the splats at which the edge of a liquid begins, and where it is all there."""
 FINE = 2.0
 """Distance of the points from which on edges are sharpened, entirely at twice as much [px]."""
+EDGE_STEP = (6.0, 12.0)
+"""Step of depth around a pixel, in spacings, from which on it shows two surfaces, and surely."""
 ROUND = 0.7
 """Shortest over longest axis from which on a splat is a ball, more and more."""
 STEP = 3.0
@@ -168,6 +170,19 @@ def _blurred(
         total.narrow(dim, here, count).add_(near[..., None] * other)
         many.narrow(dim, here, count).add_(near)
     return total / many.clamp(min=1e-12)[..., None], many
+
+
+def single(surface: Surface, spacing: float) -> Tensor:
+    """How much each pixel shows one surface, [H, W]: less where a nearer one ends before another.
+
+    The normal of such a pixel is that of neither, and would catch lamps that neither does.
+    """
+    there = surface.alpha > 0.05
+    planes = torch.stack([surface.depth, -surface.depth])
+    planes = torch.where(there, planes, -torch.inf)[None]
+    high = max_pool2d(max_pool2d(planes, (1, 3), 1, (0, 1)), (3, 1), 1, (1, 0))[0]
+    low, most = EDGE_STEP
+    return 1.0 - (((high[0] + high[1]) / spacing - low) / (most - low)).clamp(0.0, 1.0)
 
 
 def in_front(surface: Surface, alpha: Tensor, depth: Tensor, spacing: float) -> Tensor:

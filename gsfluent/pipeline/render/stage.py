@@ -34,6 +34,7 @@ from gsfluent.pipeline.liquid.clear import (
     ceiling,
     in_front,
     mirrored,
+    single,
     smoothed,
     surface_normals,
 )
@@ -476,11 +477,12 @@ def _wetted(
         share, toward = mirrored(
             surface.normal.flatten(0, 1)[pixels], pixel_rays(pixels, image.shape[1], *view)
         )
-        share = (share * there.flatten()[pixels])[:, None]
+        bare = there * single(surface, liquid.spacing)
+        share = (share * bare.flatten()[pixels])[:, None]
         mirror = ceiling(toward)[:, None] + irradiance(lit.environment, toward)
         shown = shown * (1.0 - share) + share * mirror
         if shine is not None:
-            shown = shown + (there[..., None] * to_linear(shine)).flatten(0, 1)[pixels]
+            shown = shown + (bare[..., None] * to_linear(shine)).flatten(0, 1)[pixels]
     shown = to_display(shown).clamp(0.0, 1.0).to(image)
     nearer = (cover > 0.5) & ((surface.depth < depth) | (alpha < 0.5))
     return (

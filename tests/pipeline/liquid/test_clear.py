@@ -17,6 +17,7 @@ from gsfluent.pipeline.liquid.clear import (
     covered,
     in_front,
     mirrored,
+    single,
     smoothed,
     surface_normals,
 )
@@ -134,6 +135,18 @@ def test_edges_of_a_liquid_are_sharp_where_its_points_are_seen_apart() -> None:
     assert near[0].tolist() == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0, 1.0])
     far = covered(Surface(alpha, torch.full_like(alpha, 20.0), normal), H, camera())
     torch.testing.assert_close(far, alpha)
+
+
+def test_a_pixel_of_two_surfaces_catches_no_lamp() -> None:
+    """Where a sheet ends before another one, and not on a slope, nor at an outline."""
+    depth = torch.full((9, 9), 2.0)
+    depth[:, 5:] = 2.0 + 30.0 * H
+    alpha = torch.ones(9, 9)
+    alpha[:, 8:] = 0.0
+    found = single(Surface(alpha, depth, torch.zeros(9, 9, 3)), H)
+    assert found[4].tolist()[:8] == [1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0]
+    slope = 2.0 + 2.0 * H * torch.arange(9.0).expand(9, 9)
+    assert float(single(Surface(torch.ones(9, 9), slope, torch.zeros(9, 9, 3)), H).min()) == 1.0
 
 
 def test_a_thin_spot_of_a_film_is_no_dark_pit() -> None:
