@@ -13,7 +13,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv2d, interpolate, max_pool2d, pad
+from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
 from gsfluent.data import Camera
 from gsfluent.pipeline.liquid.clear import Surface, covered, span
@@ -122,15 +122,18 @@ def _blurred(planes: Tensor, sigma: float) -> Tensor:
     step = _step(sigma)
     height, width = planes.shape[1:]
     fill = (0, -width % step, 0, -height % step)
-    coarse = avg_pool2d(pad(planes[None], fill, mode="replicate"), step)[0][:, None]
+    coarse = avg_pool2d(pad(planes[None], fill, mode="replicate"), step)
     reach = math.ceil(2.5 * sigma / step)
-    place = torch.arange(-reach, reach + 1, device=planes.device).to(planes)
     # pixels and the way back between them blur already: a box and a tent of one step
     rest = max((sigma / step) ** 2 - 0.25 * (step > 1), 1e-4)
-    bell = torch.exp(-0.5 * place * place / rest)
-    bell = bell / bell.sum()
+    bell = [math.exp(-0.5 * k * k / rest) for k in range(-reach, reach + 1)]
     coarse = pad(coarse, (reach,) * 4, mode="replicate")
-    coarse = conv2d(conv2d(coarse, bell.view(1, 1, -1, 1)), bell.view(1, 1, 1, -1))
+    for dim in (2, 3):  # no convolution: on a GPU its products may have ten bits
+        length = coarse.shape[dim] - 2 * reach
+        total = torch.zeros_like(coarse.narrow(dim, 0, length))
+        for k, weight in enumerate(bell):
+            total.add_(coarse.narrow(dim, k, length), alpha=weight / sum(bell))
+        coarse = total
     if step > 1:
         coarse = interpolate(coarse, scale_factor=step, mode="bilinear", align_corners=False)
-    return coarse[:, 0, :height, :width]
+    return coarse[0, :, :height, :width]
