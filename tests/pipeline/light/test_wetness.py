@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.pipeline.light.from_shot import clear_of
+from gsfluent.pipeline.light.from_shot import clear_of, gloss_of
 from gsfluent.pipeline.light.lamps import studio_light
 from gsfluent.pipeline.light.wetness import (
     DRIES,
@@ -19,7 +20,8 @@ from gsfluent.pipeline.light.wetness import (
     wet_colors,
     wet_gloss,
 )
-from gsfluent.pipeline.render.stage import Render
+from gsfluent.pipeline.render.film import Film
+from gsfluent.pipeline.render.stage import Picture, Render
 from gsfluent.results.frames import SavedFrame
 
 H = 0.004
@@ -189,3 +191,34 @@ def test_wet_skin_glistens_and_dry_skin_is_as_it_was() -> None:
     part = stage(wet_colors(splats, half), gloss=wet_gloss(gloss, half), wet=half).image
     assert float((part - dry)[:, :40].abs().max()) < 1e-5
     assert float((part - wet)[:, 56:].abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("wet", [True, False])
+def test_a_film_shows_what_is_wet_and_asks_nothing_where_nothing_is(wet: bool) -> None:
+    """Its pictures get the darker splats, the gloss and the film of water; dry ones none of it."""
+    before, shown = (
+        frame(k, above, 0.1 * k, pool=POOL if wet else ("ball", "wood"))
+        for k, above in enumerate((1.5, 50.0))
+    )
+    film = Film.__new__(Film)
+    film.shot = SimpleNamespace(objects={})  # type: ignore[assignment]
+    film.backdrop = film._room = None
+    film._wetness = Wetness(lambda index: before if wet else pytest.fail("loaded"), clear_of)
+    asked: dict[str, torch.Tensor] = {}
+
+    def stage(splats: Gaussians, camera: Camera, **given: torch.Tensor) -> Picture:
+        asked.update(given, colors=splats.colors())
+        return Picture(*(torch.zeros(0),) * 3, None, None, {})
+
+    film.render = stage  # type: ignore[assignment]
+    film.drawn(shown.gaussians, shown, None)  # type: ignore[arg-type]
+    colors, gloss = shown.gaussians.colors(), gloss_of(film.shot, shown)
+    assert gloss is not None
+    if wet:
+        corner = torch.arange(400).view(20, 20)[:8, :8].flatten()
+        assert float(asked["wet"][corner].min()) > 0.99
+        assert bool((asked["colors"][corner] < colors[corner] - 0.03).all())
+        assert bool((asked["gloss"][corner, 1] > gloss[corner, 1]).all())
+    else:
+        assert asked["wet"] is None
+        assert torch.equal(asked["colors"], colors) and torch.equal(asked["gloss"], gloss)
