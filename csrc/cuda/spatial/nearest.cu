@@ -3,18 +3,12 @@
 
 #include "core/nearest.h"
 #include "cuda/spatial/launch.h"
+#include "cuda/threads.h"
 
 namespace gsf::cuda {
 namespace {
 
-constexpr int kThreads = 256;
 constexpr unsigned kAll = ~0u;
-
-inline unsigned blocks_for(int64_t n) {
-  return static_cast<unsigned>((n + kThreads - 1) / kThreads);
-}
-
-__device__ int64_t thread_number() { return int64_t(blockIdx.x) * kThreads + threadIdx.x; }
 
 // Whether the levels before have left nothing to do.
 __device__ bool idle(const NearestArgs& a, int level) {
