@@ -38,8 +38,8 @@ GRAIN = 2.2e-3
 only some of the points have one."""
 SHARE, LARGEST = 1.0 / 25.0, 1.0 / 8.0
 """Smallest chip, at most, and largest, as shares of the edge of a cube of the body's volume."""
-MIST = (0.1, 0.25)
-"""Share of dust that is mist: of powder, of juice."""
+MIST = (0.1, 0.06)
+"""Share of dust that is mist: of powder, of juice; a quarter of a melon's hid all of it."""
 FINE = 5e-4
 """Mean size of the drops of mist [m] (Sauter): its volume over that is what it hides."""
 PUFF, GROWTH, WIDEST = 0.6, 0.12, 5.0

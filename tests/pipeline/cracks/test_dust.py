@@ -113,7 +113,7 @@ def test_mist_hides_what_its_drops_hide(bound: Carry) -> None:
     than 1 / 255, and where hundreds of puffs ended one behind the other there was an edge."""
     amount = 2e-3**3 * MIST[1]
     before = 1.0
-    for way in (0.01, 0.02):
+    for way in (0.005, 0.01):
         _, (_, mist) = flown(bound, way)
         wide = mist.scales[:, 0].double()
         seen = -(1.0 - THINNEST - mist.opacities.double()).log() * 2.0 * torch.pi * wide.square()
@@ -157,7 +157,8 @@ def test_chips_lie_on_the_floor_and_mist_wets_it(wet: bool) -> None:
             assert torch.equal(getattr(drawn, name)[high], getattr(free, name)[high])
         assert float(drawn.means[:, 2].min()) > floor - 1e-4
     (chips, drawn), (mist, puffs) = seen
-    assert float((drawn.means[chips.row == 0, 2] - floor).max()) < 1.0 * 6e-3
+    # the highest side of the largest chip, whose longest edge is more than that of its cube
+    assert float((drawn.means[chips.row == 0, 2] - floor).max()) < 1.25 * 6e-3
     lying = mist.row == 0
     assert float((puffs.scales[lying, 2] / puffs.scales[lying, 0]).max()) < 0.3
     darker = float(puffs.sh[lying].mean()) < float(puffs.sh[mist.row == 2].mean()) - 0.1
