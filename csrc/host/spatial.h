@@ -76,7 +76,8 @@ struct SpatialOps {
     STD_TORCH_CHECK(cell > 0 && std::isfinite(cell), op, ": cell must be positive, got ", cell);
     STD_TORCH_CHECK(reach >= 0, op, ": reach must not be negative, got ", reach);
     STD_TORCH_CHECK(count >= 1, op, ": count must be at least 1, got ", count);
-    STD_TORCH_CHECK(points.size(0) <= (int64_t(1) << 27), op, ": at most 2^27 points, got ",
+    // 32 of the largest buckets are counted in 32 bits
+    STD_TORCH_CHECK(points.size(0) < (int64_t(1) << 27), op, ": fewer than 2^27 points, got ",
                     points.size(0));
     int64_t buckets = 32;
     while (buckets < 2 * points.size(0)) buckets *= 2;
