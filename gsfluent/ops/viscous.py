@@ -108,7 +108,8 @@ def viscous_step(
 
     after, new_alpha, stress = returned
     way = torch.ones_like(share)
-    if bool((law == LAWS["nacc"]).any()):
+    brittle = bool((law == LAWS["nacc"]).any())
+    if brittle:
         trial, trial_stress = elastic(strain, increment)
         way = torch.where(time > 0, dt / (time + dt).clamp(min=1e-30), 1.0)
         late = (stress != trial_stress).any(dim=1, keepdim=True) & (time > 0)
@@ -123,7 +124,7 @@ def viscous_step(
     left = _kept_by_unloading(rate, stress, increment, modulus, dt)
     spring = left * half * elastic(half * viscous[:, :6], increment)[0]
     spring, held = elastic(spring, none)
-    if bool((law == LAWS["nacc"]).any()):  # onto the surface where it is, which stays there
+    if brittle:  # onto the surface where it is, which stays there
         inside, _, inside_stress, _ = return_mapping(
             spring, new_alpha, none, law=law, params=params, material=material, implicit=False,
             dt=INSTANT,

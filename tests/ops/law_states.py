@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsfluent.ops.plasticity import LAWS
+from gsfluent.ops.plasticity import LAWS, return_mapping
 from gsfluent.ops.reference.tensors import to_matrix, to_sym
 
 MU, KAPPA, DENSITY = 4e4, 1e5, 1000.0
@@ -84,3 +84,16 @@ def rotate(q: Tensor, sym: Tensor) -> Tensor:
 def cast(dtype: torch.dtype, *values: Any) -> tuple[Any, ...]:
     """Tensors in another dtype."""
     return tuple(v.to(dtype) for v in values)
+
+
+def assert_cuda_matches_cpu(row: dict[str, Tensor], dtype: torch.dtype) -> None:
+    """4000 states of metal through a law, on a GPU as on the CPU."""
+    s = cast(dtype, *states("von_mises", 4000))
+    t = {"law": row["law"], "params": row["params"].to(dtype)}
+    want = return_mapping(*s, **t, dt=DT)
+    got = return_mapping(*(a.cuda() for a in s), **{k: v.cuda() for k, v in t.items()}, dt=DT)
+    bound = 2e-4 if dtype == torch.float32 else 1e-10
+    assert int(want[3][0]) > 100
+    for g, w in zip(got[:3], want[:3], strict=True):
+        assert (g.cpu() - w).abs().max() <= bound * float(w.abs().max())
+    assert (got[3].cpu() - want[3]).abs().max() <= (8 if dtype == torch.float32 else 0)

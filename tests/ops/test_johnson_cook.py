@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from law_states import DT, KAPPA, cast, states, table
+from law_states import DT, KAPPA, assert_cuda_matches_cpu, cast, states, table
 from torch import Tensor
 
 from gsfluent import materials, ops
@@ -152,12 +152,4 @@ def test_a_taylor_bar_is_as_long_as_the_recovered_one() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
 @pytest.mark.parametrize("name", ROWS)
 def test_cuda_matches_cpu(name: str, dtype: torch.dtype) -> None:
-    s = cast(dtype, *states("von_mises", 4000))
-    t = {"law": ROWS[name]["law"], "params": ROWS[name]["params"].to(dtype)}
-    want = return_mapping(*s, **t, dt=DT)
-    got = return_mapping(*(a.cuda() for a in s), **{k: v.cuda() for k, v in t.items()}, dt=DT)
-    bound = 2e-4 if dtype == torch.float32 else 1e-10
-    assert int(want[3][0]) > 100
-    for g, w in zip(got[:3], want[:3], strict=True):
-        assert (g.cpu() - w).abs().max() <= bound * float(w.abs().max())
-    assert (got[3].cpu() - want[3]).abs().max() <= (8 if dtype == torch.float32 else 0)
+    assert_cuda_matches_cpu(ROWS[name], dtype)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from law_states import DT, KAPPA, MU, cast, states, table
+from law_states import DT, KAPPA, MU, assert_cuda_matches_cpu, cast, states, table
 from torch import Tensor
 
 from gsfluent import materials, ops
@@ -205,15 +205,7 @@ def test_refused_by_name() -> None:
 @pytest.mark.parametrize("name", VISCOUS)
 def test_cuda_matches_cpu(name: str, dtype: torch.dtype) -> None:
     """Rubber: test_laws.py."""
-    s, t = cast(dtype, *states("von_mises", 4000)), VISCOUS[name]
-    t = {"law": t["law"], "params": t["params"].to(dtype)}
-    want = return_mapping(*s, **t, dt=DT)
-    got = return_mapping(*(a.cuda() for a in s), **{k: v.cuda() for k, v in t.items()}, dt=DT)
-    bound = 2e-4 if dtype == torch.float32 else 1e-10
-    assert int(want[3][0]) > 100
-    for g, w in zip(got[:3], want[:3], strict=True):
-        assert (g.cpu() - w).abs().max() <= bound * float(w.abs().max())
-    assert (got[3].cpu() - want[3]).abs().max() <= (8 if dtype == torch.float32 else 0)
+    assert_cuda_matches_cpu(VISCOUS[name], dtype)
 
 
 def block(count: int = 4) -> Tensor:

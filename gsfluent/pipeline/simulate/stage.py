@@ -380,7 +380,7 @@ def moment_of(
 
     @torch.no_grad()
     def wrap() -> SimulationFrame:
-        held_here(tuple(state), pieces, units)
+        held_here(state, pieces, units)
         peak, start, broken = state.peak, matter.particles.alpha, state.ever
         damage = torch.where(start < 0, 1.0 - peak / start.clamp(max=-1e-6), (peak >= 0).to(peak))
         damage = torch.where(broken, 1.0, torch.where(matter.brittle, damage, 0.0))
