@@ -161,6 +161,19 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor(c!)[] second, float[] rates, float beta1, float beta2, float epsilon, int step, "
       "Tensor? visible) -> ()");
 
+  // --- activation: what a training changes, and what the rasterizer takes ---
+  m.def(
+      "activate(Tensor scales, Tensor opacities, Tensor sh0, Tensor sh_rest, int degree) -> "
+      "(Tensor, Tensor, Tensor)");
+  m.def(
+      "activate_backward(Tensor scales, Tensor opacities, Tensor grad_scales, "
+      "Tensor grad_opacities, Tensor grad_sh, int columns, int rest, float size, float needle, "
+      "float aspect, float opacity, Tensor(a!)? mark) -> (Tensor, Tensor, Tensor, Tensor)");
+  m.def("clamp_aspect(Tensor(a!) scales, float most) -> ()");
+  m.def(
+      "shorten_axes(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor away, "
+      "float[] origin, float voxel, float overhang) -> Tensor");
+
   // --- build information ---
   m.def("compiled_for(Tensor like) -> str");
 }

@@ -231,22 +231,18 @@ struct TrilinearArgs {
   T* value;        // [N]
 };
 
-// The value at place i; corners outside of the grid have no share.
+// The value at a place [steps]; corners outside of the grid have no share.
 template <typename T>
-GSF_INLINE void trilinear(const TrilinearArgs<T>& a, int64_t i) {
+GSF_INLINE T trilinear_at(const int64_t* shape, const T* grid, const T* place) {
   int64_t corner[3][2];
   T share[3][2];
   for (int axis = 0; axis < 3; ++axis) {
-    const T place = a.place[3 * i + axis];
     // also false for NaN; what is so far out has no neighbours in the grid
-    if (!(place > T(-1e9) && place < T(1e9))) {
-      a.value[i] = place - place;
-      return;
-    }
-    const T base = floor(place), fraction = place - base;
+    if (!(place[axis] > T(-1e9) && place[axis] < T(1e9))) return place[axis] - place[axis];
+    const T base = floor(place[axis]), fraction = place[axis] - base;
     for (int end = 0; end < 2; ++end) {
       corner[axis][end] = int64_t(base) + end;
-      const bool held = corner[axis][end] >= 0 && corner[axis][end] < a.shape[axis];
+      const bool held = corner[axis][end] >= 0 && corner[axis][end] < shape[axis];
       share[axis][end] = held ? (end ? fraction : T(1) - fraction) : T(0);
     }
   }
@@ -255,10 +251,15 @@ GSF_INLINE void trilinear(const TrilinearArgs<T>& a, int64_t i) {
     const int x = k >> 2, y = k >> 1 & 1, z = k & 1;
     const T part = product(product(share[0][x], share[1][y]), share[2][z]);
     if (part == T(0)) continue;
-    const int64_t at = (corner[0][x] * a.shape[1] + corner[1][y]) * a.shape[2] + corner[2][z];
-    total += product(part, a.grid[at]);
+    const int64_t at = (corner[0][x] * shape[1] + corner[1][y]) * shape[2] + corner[2][z];
+    total += product(part, grid[at]);
   }
-  a.value[i] = total;
+  return total;
+}
+
+template <typename T>
+GSF_INLINE void trilinear(const TrilinearArgs<T>& a, int64_t i) {
+  a.value[i] = trilinear_at(a.shape, a.grid, a.place + 3 * i);
 }
 
 // --- value noise ---

@@ -36,7 +36,7 @@ __getattr__, __dir__, __all__ = lazy(
         ),
         "gsfluent.ops.deform": ("polar_clamped", "covariance_axes", "carry_axes", "carry_place"),
         "gsfluent.ops.mvee": ("mvee", "mvee_lens"),
-        "gsfluent.ops.raster": ("Rendered", "rasterize"),
+        "gsfluent.ops.raster": ("Recorded", "Rendered", "rasterize", "rasterize_recorded"),
         "gsfluent.ops.density": ("Bulk", "splat_bulk", "occupancy", "density_normals"),
         "gsfluent.ops.spatial": (
             "box_blur",
@@ -49,7 +49,14 @@ __getattr__, __dir__, __all__ = lazy(
         ),
         "gsfluent.ops.graph": ("components", "link_costs", "nearest_seeds"),
         "gsfluent.ops.shade": ("shade",),
-        "gsfluent.ops.losses": ("Photometric", "photometric_loss", "ssim"),
+        "gsfluent.ops.losses": ("Photometric", "photometric_loss", "photometric_slopes", "ssim"),
         "gsfluent.ops.adam": ("adam_step",),
+        "gsfluent.ops.activation": (
+            "Activated",
+            "activate",
+            "activate_backward",
+            "clamp_aspect",
+            "shorten_axes",
+        ),
     },
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -68,21 +70,43 @@ class Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         """See :func:`backward`."""
-        image, instances, means = (ctx.saved_tensors[k] for k in (0, 7, 8))
-        if instances.device.type == "cpu":
-            # six moments and the features of the image, for each
-            refuse_pairs(instances.numel(), 6 + image.shape[-1], image.element_size())
-        try:
+        given = [t for k, t in enumerate(ctx.saved_tensors[8:]) if ctx.needs_input_grad[k]]
+        with guarded(ctx.saved_tensors, given):
             return backward(ctx, *grads)
-        except RuntimeError as error:
-            if not is_shortage(error):
-                raise
-            given = [t for k, t in enumerate(ctx.saved_tensors[8:]) if ctx.needs_input_grad[k]]
-            need = sum(t.numel() * t.element_size() for t in given)
-            raise shortage_error(means.device)(
-                f"rasterize: the gradients of {means.shape[0]} Gaussians need at least {need} "
-                f"bytes ({need / 2**30:.1f} GiB) on {means.device}, which could not be allocated"
-            ) from error
+
+
+@contextmanager
+def guarded(saved: Sequence[Tensor | None], given: Sequence[Tensor | None]) -> Iterator[None]:
+    """Say what memory the adjoint lacks: ``saved`` as it takes them, ``given`` with gradients."""
+    image, instances, means = saved[0], saved[7], saved[8]
+    assert image is not None and instances is not None and means is not None
+    if instances.device.type == "cpu":
+        # six moments and the features of the image, for each
+        refuse_pairs(instances.numel(), 6 + image.shape[-1], image.element_size())
+    try:
+        yield
+    except RuntimeError as error:
+        if not is_shortage(error):
+            raise
+        need = sum(t.numel() * t.element_size() for t in given if t is not None)
+        raise shortage_error(means.device)(
+            f"rasterize: the gradients of {means.shape[0]} Gaussians need at least {need} "
+            f"bytes ({need / 2**30:.1f} GiB) on {means.device}, which could not be allocated"
+        ) from error
+
+
+def adjoint(
+    arguments: Sequence[Any], output: Sequence[Tensor], image: Tensor, alpha: Tensor | None
+) -> tuple[Tensor, ...]:
+    """Gradients from those of image and opacity, without autograd, in the operator's order."""
+    width, height, antialiased, _, depth, _, near, far, deterministic = arguments[_TENSORS:]
+    saved = (*[output[k] for k in _DIFFERENTIABLE], *output[7:], *arguments[:_TENSORS])
+    numbers = (width, height, antialiased, depth, near, far, deterministic)
+    with guarded(saved, arguments[:_TENSORS]):
+        found: tuple[Tensor, ...] = torch.ops.gsfluent.rasterize_backward.default(
+            image, alpha, None, None, *saved, *numbers
+        )
+    return found
 
 
 torch.library.register_autograd("gsfluent::rasterize", backward, setup_context=setup_context)

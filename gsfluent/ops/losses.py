@@ -123,6 +123,72 @@ def photometric_loss(
     Determinism: bit-identical on the CPU for any number of threads, and on CUDA from run to run.
     Source: Kerbl et al. 2023, equation 7; docs/theory/losses.md.
     """
+    loss, figures, _, _ = _photometric(
+        image, target, ssim_weight, padding, valid, alpha, mask, backdrop, mask_weight
+    )
+    return _named(loss, figures)
+
+
+@torch.no_grad()
+def photometric_slopes(
+    image: Tensor,
+    target: Tensor,
+    *,
+    ssim_weight: float = 0.2,
+    padding: str = "valid",
+    valid: Tensor | None = None,
+    alpha: Tensor | None = None,
+    mask: Tensor | None = None,
+    backdrop: Tensor | None = None,
+    mask_weight: float = 0.0,
+) -> tuple[Photometric, Tensor, Tensor | None]:
+    """:func:`photometric_loss` and its gradients at once, without autograd.
+
+    Args:
+        image: See :func:`photometric_loss`, also of all others.
+        target: See there.
+        ssim_weight: See there.
+        padding: See there.
+        valid: See there.
+        alpha: See there.
+        mask: See there.
+        backdrop: See there.
+        mask_weight: See there.
+
+    Returns:
+        The loss, its gradient with respect to the image [H, W, C], and to alpha [H, W] if given.
+
+    Raises:
+        TypeError: As :func:`photometric_loss`.
+        ValueError: As :func:`photometric_loss`.
+
+    Gradient: none.
+    Determinism: as :func:`photometric_loss`.
+    """
+    loss, figures, of_image, of_alpha = _photometric(
+        image, target, ssim_weight, padding, valid, alpha, mask, backdrop, mask_weight, True
+    )
+    return _named(loss, figures), of_image, None if alpha is None else of_alpha
+
+
+def _named(loss: Tensor, figures: Tensor) -> Photometric:
+    similarity, l1, mse, excess = figures.unbind()
+    return Photometric(loss, l1, similarity, mse, excess)
+
+
+def _photometric(
+    image: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    padding: str,
+    valid: Tensor | None,
+    alpha: Tensor | None,
+    mask: Tensor | None,
+    backdrop: Tensor | None,
+    mask_weight: float,
+    slopes: bool = False,
+) -> tuple[Tensor, ...]:
+    """Loss, figures and gradients, as the operator gives them."""
     op = "photometric_loss"
     inside = _check_images(op, image, target, padding)
     if not 0.0 <= ssim_weight <= 1.0:
@@ -144,11 +210,8 @@ def photometric_loss(
                 f"{op}: no gradient with respect to {name}; pass {name}.detach()"
             )
     weights = (ssim_weight, 1.0 - ssim_weight, -ssim_weight, mask_weight)
-    loss, figures = _loss(
-        image, target, weights, inside=inside, pixels=True, planes=(valid, alpha, mask, backdrop)
-    )
-    similarity, l1, mse, excess = figures.unbind()
-    return Photometric(loss, l1, similarity, mse, excess)
+    planes = (valid, alpha, mask, backdrop)
+    return _loss(image, target, weights, inside=inside, pixels=True, planes=planes, slopes=slopes)
 
 
 def _check_images(op: str, image: Tensor, target: Tensor, padding: str) -> bool:
@@ -185,13 +248,15 @@ def _loss(
     inside: bool,
     pixels: bool,
     planes: tuple[Tensor | None, ...] = (None, None, None, None),
-) -> tuple[Tensor, Tensor]:
+    slopes: bool = False,
+) -> tuple[Tensor, ...]:
     alpha = planes[1]
     wanted = image.requires_grad or (alpha is not None and alpha.requires_grad)
-    loss, figures, _, _ = torch.ops.gsfluent.photometric_loss(
-        image, target, *planes, *weights, inside, pixels, wanted and torch.is_grad_enabled()
+    wanted = slopes or (wanted and torch.is_grad_enabled())
+    found: tuple[Tensor, ...] = torch.ops.gsfluent.photometric_loss(
+        image, target, *planes, *weights, inside, pixels, wanted
     )
-    return loss, figures
+    return found
 
 
 def _map_shape(image: Tensor, inside: bool) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ from gsfluent.ops._memory import (
     shortage,
     shortage_error,
 )
-from gsfluent.ops._raster_grad import Rasterize
+from gsfluent.ops._raster_grad import Rasterize, adjoint
 
 _OP = "rasterize"
 _MAX_CHANNELS = 32
@@ -173,16 +173,139 @@ def rasterize(
         outputs = torch.ops.gsfluent.rasterize(*_checked(arguments))
     else:
         outputs = _run(arguments)
+    return _rendered(arguments, outputs)
+
+
+def _rendered(a: Arguments, outputs: tuple[Tensor, ...]) -> Rendered:
     image, alpha, depths, median, normal, weight, radii = outputs[:7]
     return Rendered(
         image,
         alpha,
-        depths if depth else None,
-        normal if normals is not None else None,
-        weight if contribution else None,
+        depths if a.depth else None,
+        normal if a.normals is not None else None,
+        weight if a.contribution else None,
         radii,
-        median if median_depth else None,
+        median if a.median_depth else None,
     )
+
+
+class Slopes(NamedTuple):
+    """Gradients of :func:`rasterize_recorded`'s arguments, each of its shape."""
+
+    means: Tensor
+    opacities: Tensor
+    quats: Tensor
+    scales: Tensor
+    sh: Tensor
+    probe: Tensor
+    """Of the projected centres [px], [N, 2]; empty without a probe."""
+
+
+class Recorded(NamedTuple):
+    """What :func:`rasterize_recorded` returns."""
+
+    rendered: Rendered
+    arguments: Arguments
+    outputs: tuple[Tensor, ...]
+
+    @torch.no_grad()
+    def adjoint(self, image: Tensor, alpha: Tensor | None = None) -> Slopes:
+        """Gradients of a loss.
+
+        Args:
+            image: Its gradient with respect to the image, [H, W, 3].
+            alpha: The same of the opacity, [H, W]; 0 when None.
+
+        Returns:
+            Those of the arguments.
+
+        Raises:
+            RuntimeError: A shape, dtype or device does not fit.
+            MemoryError: As :func:`rasterize`.
+        """
+        found = adjoint(self.arguments, self.outputs, image, alpha)
+        means, opacities, quats, scales, _, sh, _, _, _, offset, absolute = found
+        probe = offset if self.arguments.means2d_offset is not None else absolute
+        return Slopes(means, opacities, quats, scales, sh, probe)
+
+
+@torch.no_grad()
+def rasterize_recorded(
+    means: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    quats: Tensor,
+    scales: Tensor,
+    sh: Tensor,
+    probe: Tensor | None = None,
+    absgrad: bool = False,
+    near: float = 0.01,
+    far: float = 1e6,
+    deterministic: bool = False,
+) -> Recorded:
+    """:func:`rasterize` of one camera, with its adjoint to be called by hand.
+
+    A training draws one photograph after the other, and autograd's part of a step takes as long on
+    a GPU as the kernels do.
+
+    Args:
+        means: See :func:`rasterize`, also of all that is not named here.
+        opacities: See there.
+        viewmat: World to camera, [4, 4].
+        K: Intrinsics, [3, 3].
+        width: Image width [px].
+        height: Image height [px].
+        quats: Rotations, [N, 4].
+        scales: Standard deviations, [N, 3].
+        sh: Spherical harmonics, [N, (degree + 1)^2, 3].
+        probe: Zeros [N, 2]: the adjoint gives the gradient of the projected centres.
+        absgrad: It gives the sum of its absolute values over the pixels instead.
+        near: Nearest camera z that is drawn.
+        far: Farthest camera z that is drawn.
+        deterministic: The same bits of the gradients in every run on a GPU too.
+
+    Returns:
+        The picture without depth, and what its adjoint needs.
+
+    Raises:
+        TypeError: As :func:`rasterize`.
+        ValueError: As :func:`rasterize`.
+        MemoryError: As :func:`rasterize`.
+
+    Gradient: by hand, :meth:`Recorded.adjoint`.
+    Determinism: as :func:`rasterize`.
+    """
+    arguments = Arguments(
+        means,
+        opacities,
+        viewmat,
+        K,
+        quats,
+        scales,
+        None,
+        sh,
+        None,
+        None,
+        None,
+        None,
+        None if absgrad else probe,
+        probe if absgrad else None,
+        width,
+        height,
+        False,
+        False,
+        False,
+        False,
+        near,
+        far,
+        deterministic or torch.are_deterministic_algorithms_enabled(),
+    )
+    outputs = _run(arguments)
+    return Recorded(_rendered(arguments, outputs), arguments, outputs)
 
 
 def _run(arguments: Arguments) -> tuple[Tensor, ...]:

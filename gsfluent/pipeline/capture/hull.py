@@ -84,6 +84,14 @@ class Hull:
         away = trilinear(self._beyond.to(points), held) + (place - held).norm(dim=1)
         return away * self.voxel
 
+    def distances(self) -> tuple[Tensor, list[float]]:
+        """How far the points of a grid lie outside the hull [voxels], and where the first lies."""
+        return self._beyond, [x - (_RIM - 0.5) * self.voxel for x in self._corner]
+
+    @functools.cached_property
+    def _corner(self) -> list[float]:
+        return [float(x) for x in self.origin]  # read once: it waits for the device
+
     @functools.cached_property
     def _beyond(self) -> Tensor:
         """Distances of the voxels outside from the boundary [voxels], with a rim."""

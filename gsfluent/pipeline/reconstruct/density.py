@@ -20,7 +20,7 @@ from gsfluent.errors import RunError
 from gsfluent.geometry import normalize_quaternions, quaternion_to_matrix
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView
-from gsfluent.pipeline.reconstruct.model import SplatModel
+from gsfluent.pipeline.reconstruct.model import Pulls, SplatModel
 from gsfluent.pipeline.reconstruct.recipe import Recipe
 
 _SPLIT_FACTOR = 1.6  # a split Gaussian's parts are this much smaller (Kerbl et al. 2023)
@@ -40,8 +40,7 @@ _ASPECT = 4.0  # longest over middle axis of what is kept: more is a needle
 _OVERHANG = 0.004  # of the object's size: how far a Gaussian may reach beyond the hull
 _LOOSE = 0.01  # the same in training: a tighter hold costs half a decibel inside the masks
 _SEEN = 0.02  # opacity at which a Gaussian ends for the eye
-_LEAST_AXIS = 0.02  # of its length that an axis keeps when the hull cuts it
-_HALVINGS = 8  # of the interval in which the cut of an axis lies
+_ROUNDING = 1e-3  # of the overhang
 
 
 def draws(seed: int, purpose: int, step: int) -> torch.Generator:
@@ -56,10 +55,9 @@ class Place:
     hull: Hull | None  # visual hull of the object; None for a whole scene
     eyes: Tensor  # camera positions [V, 3]
 
-    @torch.no_grad()
     def misplaced(self, model: SplatModel) -> Tensor:
         """Gaussians that are huge, not finite, outside the hull or right before a lens, [N]."""
-        means, largest = model.parameters["means"].detach(), model.scales().amax(1)
+        means, largest = model.parameters["means"], model.scales().amax(1)
         wrong = ~torch.isfinite(means).all(1)
         if self.hull is not None:
             wrong |= largest >= 0.3 * model.extent
@@ -71,23 +69,22 @@ class Place:
             wrong |= largest >= model.extent
         return wrong
 
-    @torch.no_grad()
     def restrain(self, model: SplatModel) -> None:
         """Shorten what reaches beyond the hull until it ends there; nothing without a hull."""
         if self.hull is None or model.isotropic:
             return
+        p, splats = model.parameters, model.activated(0)
         rooms = shortened(
-            model.parameters["means"].detach(),
-            model.parameters["quats"].detach(),
-            model.scales(),
-            model.opacities(),
+            p["means"],
+            p["quats"],
+            splats.scales,
+            splats.opacities,
             self.hull,
             _LOOSE * 2.0 * model.extent,
         )
-        model.parameters["scales"].detach().add_(rooms.log())
+        p["scales"].add_(rooms.log())
 
 
-@torch.no_grad()
 def ends(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, share: Tensor | None = None
 ) -> Tensor:
@@ -111,7 +108,6 @@ def ends(
     return torch.stack([means[:, None] + axes, means[:, None] - axes], 2)
 
 
-@torch.no_grad()
 def shortened(
     means: Tensor,
     quats: Tensor,
@@ -124,17 +120,17 @@ def shortened(
 
     At least 0.02 is left, also of what has its centre farther out.
     """
-    share = torch.ones_like(scales)
-    rows = (_beyond(hull, ends(means, quats, scales, opacities)) > overhang).any(1).nonzero()[:, 0]
-    part = (means[rows], quats[rows], scales[rows], opacities[rows])
-    low, high = torch.zeros_like(part[2]), torch.ones_like(part[2])
-    fits = _beyond(hull, ends(*part)) <= overhang
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        good = _beyond(hull, ends(*part, share=middle)) <= overhang
-        low, high = torch.where(good, middle, low), torch.where(good, high, middle)
-    share[rows] = torch.where(fits, torch.ones_like(low), low.clamp_min(_LEAST_AXIS))
-    return share
+    away, origin = hull.distances()
+    return ops.shorten_axes(
+        means,
+        quats,
+        scales,
+        opacities,
+        away.to(means),
+        origin=origin,
+        voxel=hull.voxel,
+        overhang=overhang,
+    )
 
 
 def contained(gaussians: Gaussians, hull: Hull) -> tuple[Gaussians, int]:
@@ -147,24 +143,15 @@ def contained(gaussians: Gaussians, hull: Hull) -> tuple[Gaussians, int]:
     shape = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     scales = gaussians.scales * shortened(*shape, hull, overhang)
     cut = ends(gaussians.means, gaussians.quats, scales, gaussians.opacities)
-    keep = (_beyond(hull, cut) <= overhang).all(1)
+    away = hull.beyond(cut.reshape(-1, 3)).reshape(-1, 6)
+    keep = (away <= overhang * (1.0 + _ROUNDING)).all(1)
     return gaussians.replace(scales=scales).select(keep), int((~keep).sum())
 
 
-def _beyond(hull: Hull, points: Tensor) -> Tensor:
-    """How far both ends [N, 3, 2, 3] of each axis lie outside, the farther one, [N, 3]."""
-    return hull.beyond(points.reshape(-1, 3)).reshape(points.shape[:3]).amax(2)
-
-
-@torch.no_grad()
 def clamp_aspect(model: SplatModel) -> None:
     """No longest axis over four times the middle one; needles swing and stick out."""
-    if model.isotropic:
-        return
-    scales = model.parameters["scales"].detach()
-    a, b, c = scales.unbind(1)
-    middle = torch.maximum(torch.minimum(a, b), torch.minimum(torch.maximum(a, b), c))
-    scales.copy_(torch.minimum(scales, (middle + math.log(_ASPECT))[:, None]))
+    if not model.isotropic:
+        ops.clamp_aspect(model.parameters["scales"], _ASPECT)
 
 
 @dataclass(frozen=True)
@@ -182,15 +169,15 @@ class Density:
     absgrad = False
 
     def probe(self, model: SplatModel) -> Tensor | None:
-        """Zeros [N, 2] that shall receive the screen-space gradient, or None."""
+        """Zeros [N, 2] for the projected centres when their gradient is wanted, or None."""
         return None
 
-    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
-        """Take note of one view after its backward pass."""
+    def observe(self, radii: Tensor, slope: Tensor, view: TrainView) -> None:
+        """Take note of one view: radii [N], and the gradient [N, 2] if :meth:`probe` wants it."""
 
-    def penalty(self, model: SplatModel) -> Tensor | None:
-        """A term of the loss."""
-        return None
+    def pulls(self, model: SplatModel) -> Pulls:
+        """Weights of penalties in the loss."""
+        return Pulls()
 
     def after_step(self, model: SplatModel, done: int) -> None:
         """Called after every optimiser step."""
@@ -238,28 +225,26 @@ class Adc(Density):
         self.gradient = self.visits = torch.empty(0)
 
     def probe(self, model: SplatModel) -> Tensor | None:
-        """Zeros that receive the gradient, while the count may grow."""
+        """Zeros, while the count may grow."""
         if model.steps >= self.recipe.densify_until * self.iterations:
             return None
-        return torch.zeros(model.count, 2, device=model.device, requires_grad=True)
+        return torch.zeros(model.count, 2, device=model.device)
 
-    @torch.no_grad()
-    def observe(self, rendered: ops.raster.Rendered, probe: Tensor | None, view: TrainView) -> None:
+    def observe(self, radii: Tensor, slope: Tensor, view: TrainView) -> None:
         """Add one view's screen-space gradient, in units of half the image width."""
-        if probe is None or probe.grad is None:
+        if slope.numel() == 0:
             return
-        if len(self.gradient) != len(probe):
-            self.gradient = torch.zeros(len(probe), device=probe.device)
+        if len(self.gradient) != len(slope):
+            self.gradient = torch.zeros(len(slope), device=slope.device)
             self.visits = torch.zeros_like(self.gradient)
-        self.gradient += probe.grad.norm(dim=1) * (0.5 * view.full_width)  # 0 where not seen
-        self.visits += rendered.radii > 0
+        # 0 where not seen
+        self.gradient.add_(slope.norm(dim=1), alpha=0.5 * view.full_width)
+        self.visits += radii > 0
 
-    def penalty(self, model: SplatModel) -> Tensor | None:
+    def pulls(self, model: SplatModel) -> Pulls:
         """Pull on opacities, as the recipe has it, while the count may grow."""
-        recipe = self.recipe
-        if recipe.opacity_pull == 0 or model.steps >= recipe.densify_until * self.iterations:
-            return None
-        return recipe.opacity_pull * model.opacities().mean()
+        growing = model.steps < self.recipe.densify_until * self.iterations
+        return Pulls(opacity=self.recipe.opacity_pull if growing else 0.0)
 
     def after_step(self, model: SplatModel, done: int) -> None:
         """Reset opacities when it is time."""
@@ -268,7 +253,6 @@ class Adc(Density):
         if recipe.reset_every and done % recipe.reset_every == 0 and growing:
             reset_opacities(model)
 
-    @torch.no_grad()
     def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
         """Clone and split, then prune what is transparent or misplaced.
 
@@ -308,16 +292,14 @@ class Adc(Density):
         self.gradient, self.visits = state["gradient"].to(device), state["visits"].to(device)
 
 
-@torch.no_grad()
 def reset_opacities(model: SplatModel) -> None:
     """Cut opacities to 0.01, so that only what the photographs need comes back."""
     ceiling = math.log(_RESET_OPACITY / (1.0 - _RESET_OPACITY))
-    model.parameters["opacities"].detach().clamp_(max=ceiling)
+    model.parameters["opacities"].clamp_(max=ceiling)
     model.first["opacities"].zero_()
     model.second["opacities"].zero_()
 
 
-@torch.no_grad()
 def densify(
     model: SplatModel, score: Tensor, threshold: float, limit: int, generator: torch.Generator
 ) -> int:
@@ -340,14 +322,14 @@ def densify(
     scales = model.scales()[chosen]
     large = scales.amax(1) > _SPLIT_ABOVE * model.extent
     draw = torch.randn(room, 3, generator=generator).to(scales)
-    quats = normalize_quaternions(model.parameters["quats"].detach()[chosen])
+    quats = normalize_quaternions(model.parameters["quats"][chosen])
     shift = (quaternion_to_matrix(quats) @ (draw * scales)[..., None])[..., 0] * large[:, None]
     smaller = math.log(_SPLIT_FACTOR) * large[:, None]
     new = model.rows(chosen)
     new["means"] += shift
     new["scales"] -= smaller
-    model.parameters["scales"].detach()[chosen] -= smaller
-    model.parameters["means"].detach()[chosen] -= shift
+    model.parameters["scales"][chosen] -= smaller
+    model.parameters["means"][chosen] -= shift
     model.append(new)
     return room
 
@@ -370,12 +352,10 @@ class Mcmc(Density):
         self.place, self.seed = place, seed
         self.generator: torch.Generator | None = None
 
-    def penalty(self, model: SplatModel) -> Tensor | None:
+    def pulls(self, model: SplatModel) -> Pulls:
         """Pull on opacities and scales, so that Gaussians that are not needed die."""
-        size = model.scales().mean() / model.extent
-        return _MCMC_OPACITY * model.opacities().mean() + _MCMC_SCALE * size
+        return Pulls(size=_MCMC_SCALE, opacity=_MCMC_OPACITY)
 
-    @torch.no_grad()
     def after_step(self, model: SplatModel, done: int) -> None:
         """Shake the centres along each Gaussian, the transparent ones most."""
         if done % _NOISE_EVERY != 0:
@@ -384,19 +364,18 @@ class Mcmc(Density):
             self.generator = torch.Generator(device=model.device)
         generator = self.generator
         generator.manual_seed((self.seed * 1_000_003 + done) * 8 + 2)
-        means = model.parameters["means"].detach()
+        means = model.parameters["means"]
         draw = torch.randn(means.shape, generator=generator, device=means.device)
         # sigmoid(-k (o - 0.005)): 1/2 at the opacity that is dead, none from 0.05 on
         weight = torch.sigmoid(-_SHARPNESS * (model.opacities() - _DEAD))
         # covariances over the extent: the original lets the scene have the size 1
         rate = _NOISE * _NOISE_END ** (done / self.iterations) / model.extent
         rate *= math.sqrt(_NOISE_EVERY)
-        turn = quaternion_to_matrix(normalize_quaternions(model.parameters["quats"].detach()))
+        turn = quaternion_to_matrix(normalize_quaternions(model.parameters["quats"]))
         variance = model.scales().square()
         local = (turn.transpose(1, 2) @ draw[..., None])[..., 0] * variance
         means += (turn @ local[..., None])[..., 0] * (weight * rate)[:, None]
 
-    @torch.no_grad()
     def control(self, model: SplatModel, done: int, wanted: Wanted) -> None:
         """Relocate the dead, and grow.
 
@@ -461,7 +440,6 @@ def shared_out(opacity: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor,
     return each.to(scales), scales * factor.to(scales)[:, None]
 
 
-@torch.no_grad()
 def relocate(model: SplatModel, dead: Tensor, weight: Tensor, generator: torch.Generator) -> None:
     """Move dead Gaussians onto living ones, drawn by ``weight`` [N]; the picture stays."""
     gone = dead.nonzero()[:, 0]
@@ -470,11 +448,10 @@ def relocate(model: SplatModel, dead: Tensor, weight: Tensor, generator: torch.G
     source = _draw(weight, len(gone), generator)
     _share(model, source)
     for name, value in model.rows(source).items():
-        model.parameters[name].detach()[gone] = value
+        model.parameters[name][gone] = value
     model.forget(gone)
 
 
-@torch.no_grad()
 def grow(model: SplatModel, count: int, weight: Tensor, generator: torch.Generator) -> None:
     """Add ``count`` Gaussians by sharing out those drawn by ``weight`` [N]; the picture stays."""
     source = _draw(weight, count, generator)
@@ -495,7 +472,7 @@ def _share(model: SplatModel, source: Tensor) -> None:
     named, counts = source.unique(return_counts=True)
     opacity, scales = shared_out(model.opacities()[named], model.scales()[named], counts + 1)
     raw = torch.logit(opacity.clamp(_DEAD, 1.0 - 1e-6))
-    model.parameters["opacities"].detach()[named] = raw
+    model.parameters["opacities"][named] = raw
     width = model.parameters["scales"].shape[1]
-    model.parameters["scales"].detach()[named] = scales[:, :width].log()
+    model.parameters["scales"][named] = scales[:, :width].log()
     model.forget(named)

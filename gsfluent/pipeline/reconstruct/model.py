@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -13,8 +15,17 @@ from gsfluent.pipeline.reconstruct.recipe import LearningRates
 
 _BETA1 = 0.9
 _EPSILON = 1e-15
+_NEEDLE = 6.0  # longest over middle axis before it is pulled back
 
 Rows = dict[str, Tensor]
+
+
+class Pulls(NamedTuple):
+    """Weights of penalties in the loss."""
+
+    size: float = 0.0  # of the mean scale, in units of the extent
+    needle: float = 0.0  # of the mean excess of longest over middle axis, over 6
+    opacity: float = 0.0  # of the mean opacity
 
 
 class SplatModel:
@@ -54,8 +65,7 @@ class SplatModel:
             "sh_rest": start.sh[:, 1:],
         }
         self.parameters = {
-            name: value.detach().clone().contiguous().requires_grad_()
-            for name, value in self.parameters.items()
+            name: value.detach().clone().contiguous() for name, value in self.parameters.items()
         }
         self.first = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
         self.second = {name: torch.zeros_like(p) for name, p in self.parameters.items()}
@@ -80,13 +90,16 @@ class SplatModel:
         """Peak opacities [N]."""
         return torch.sigmoid(self.parameters["opacities"])
 
+    def activated(self, degree: int) -> ops.activation.Activated:
+        """The splats as the rasterizer takes them, with ``degree`` bands of SH."""
+        p = self.parameters
+        return ops.activate(p["scales"], p["opacities"], p["sh0"], p["sh_rest"], degree)
+
     def render(
         self,
         view: TrainView,
         degree: int,
-        offset: Tensor | None = None,
         *,
-        absgrad: bool = False,
         features: Tensor | None = None,
         contribution: bool = False,
     ) -> ops.raster.Rendered:
@@ -95,46 +108,100 @@ class SplatModel:
         Args:
             view: The camera.
             degree: SH bands that are used.
-            offset: Zeros [N, 2] that receive the gradient of the projected centres.
-            absgrad: They receive the sum of its absolute values over the pixels.
             features: Values [N, C] to blend instead of the colours.
             contribution: Also sum each Gaussian's blend weights.
         """
-        p = self.parameters
-        sh = None
-        if features is None:
-            sh = p["sh0"]
-            if degree > 0:
-                sh = torch.cat([sh, p["sh_rest"][:, : (degree + 1) ** 2 - 1]], dim=1)
-        width, height = view.size
+        p, splats = self.parameters, self.activated(degree)
         return ops.rasterize(
             p["means"],
-            self.opacities(),
+            splats.opacities,
             view.viewmat,
             view.K,
-            width,
-            height,
+            *view.size,
             quats=p["quats"],
-            scales=self.scales().contiguous(),
-            sh=sh,
+            scales=splats.scales,
+            sh=splats.sh if features is None else None,
             colors=features,
-            means2d_offset=None if absgrad else offset,
-            means2d_absgrad=offset if absgrad else None,
             contribution=contribution,
             depth=False,
             near=0.01 * self.extent,
             deterministic=self.deterministic,
         )
 
+    def record(
+        self,
+        view: TrainView,
+        splats: ops.activation.Activated,
+        probe: Tensor | None = None,
+        *,
+        absgrad: bool = False,
+    ) -> ops.raster.Recorded:
+        """Render one view before black, with its adjoint.
+
+        Args:
+            view: The camera.
+            splats: From :meth:`activated`.
+            probe: Zeros [N, 2] that stand for the projected centres: their gradient is wanted.
+            absgrad: The sum of its absolute values over the pixels is.
+        """
+        return ops.rasterize_recorded(
+            self.parameters["means"],
+            splats.opacities,
+            view.viewmat,
+            view.K,
+            *view.size,
+            quats=self.parameters["quats"],
+            scales=splats.scales,
+            sh=splats.sh,
+            probe=probe,
+            absgrad=absgrad,
+            near=0.01 * self.extent,
+            deterministic=self.deterministic,
+        )
+
     # -- optimisation ----------------------------------------------------------------------------
-    @torch.no_grad()
-    def step(self, progress: float) -> None:
-        """One Adam step, then clear the gradients; ``progress`` in [0, 1] sets the decay."""
+    def gradients(
+        self,
+        splats: ops.activation.Activated,
+        slopes: ops.raster.Slopes,
+        pulls: Pulls,
+        mark: Tensor | None = None,
+    ) -> Rows:
+        """Gradients of the parameters.
+
+        Args:
+            splats: From :meth:`activated`.
+            slopes: Of what was drawn with them.
+            pulls: Weights of the penalties.
+            mark: A scalar that becomes NaN where a splat has no finite shape.
+        """
+        raw = ops.activate_backward(
+            splats,
+            slopes.scales,
+            slopes.opacities,
+            slopes.sh,
+            columns=self.parameters["scales"].shape[1],
+            rest=self.parameters["sh_rest"].shape[1],
+            size=pulls.size / (3 * self.count * self.extent),
+            needle=pulls.needle / self.count,
+            aspect=_NEEDLE,
+            opacity=pulls.opacity / self.count,
+            mark=mark,
+        )
+        shapes = {"means": slopes.means, "quats": slopes.quats, "scales": raw.scales}
+        return shapes | {
+            "opacities": raw.opacities,
+            "sh0": raw.sh0,
+            "sh_rest": raw.sh_rest,
+        }
+
+    def step(self, gradients: Rows, progress: float) -> None:
+        """One Adam step; ``progress`` in [0, 1] sets the decay."""
         self.steps += 1
         names = [name for name, value in self.parameters.items() if value.numel() > 0]
         ops.adam_step(
-            [self.parameters[name].detach() for name in names],
-            [self.parameters[name].grad for name in names],
+            [self.parameters[name] for name in names],
+            [gradients[name] for name in names],
             [self.first[name] for name in names],
             [self.second[name] for name in names],
             lr=[
@@ -145,51 +212,38 @@ class SplatModel:
             betas=(_BETA1, self.rates.beta2),
             eps=_EPSILON,
         )
-        for parameter in self.parameters.values():
-            parameter.grad = None
 
     # -- rows ------------------------------------------------------------------------------------
-    @torch.no_grad()
     def rows(self, index: Tensor) -> Rows:
         """Copies of rows ``index`` [M] of every parameter."""
-        return {name: p.detach()[index] for name, p in self.parameters.items()}
+        return {name: p[index] for name, p in self.parameters.items()}
 
-    @torch.no_grad()
     def append(self, rows: Rows) -> None:
         """Add rows; their moments start at zero."""
         zeros = {name: torch.zeros_like(value) for name, value in rows.items()}
-        self.parameters = {
-            name: torch.cat([p.detach(), rows[name]]).requires_grad_()
-            for name, p in self.parameters.items()
-        }
+        self.parameters = {name: torch.cat([p, rows[name]]) for name, p in self.parameters.items()}
         self.first = {name: torch.cat([m, zeros[name]]) for name, m in self.first.items()}
         self.second = {name: torch.cat([m, zeros[name]]) for name, m in self.second.items()}
 
-    @torch.no_grad()
     def forget(self, index: Tensor) -> None:
         """Clear the moments of rows ``index`` [M]."""
         for moments in (self.first, self.second):
             for value in moments.values():
                 value[index] = 0.0
 
-    @torch.no_grad()
     def keep(self, mask: Tensor) -> None:
         """Drop the Gaussians outside ``mask``, bool [N]."""
         if bool(mask.all()):
             return
         index = mask.nonzero()[:, 0]
-        self.parameters = {name: p[index].requires_grad_() for name, p in self._detached().items()}
+        self.parameters = self.rows(index)
         self.first = {name: m[index] for name, m in self.first.items()}
         self.second = {name: m[index] for name, m in self.second.items()}
 
-    def _detached(self) -> Rows:
-        return {name: value.detach() for name, value in self.parameters.items()}
-
     # -- in and out ------------------------------------------------------------------------------
-    @torch.no_grad()
     def gaussians(self, degree: int) -> Gaussians:
         """The splats with activated values; rows with non-finite values are left out."""
-        p = self._detached()
+        p = self.parameters
         sh = torch.cat([p["sh0"], p["sh_rest"][:, : (degree + 1) ** 2 - 1]], dim=1)
         quats = normalize_quaternions(p["quats"])
         result = Gaussians(p["means"], quats, self.scales().contiguous(), self.opacities(), sh)
@@ -202,7 +256,7 @@ class SplatModel:
         """Everything needed to go on, tensors only."""
         groups = {"parameter": self.parameters, "first": self.first, "second": self.second}
         flat = {
-            f"{group}.{name}": value.detach()
+            f"{group}.{name}": value
             for group, values in groups.items()
             for name, value in values.items()
         }
@@ -218,7 +272,7 @@ class SplatModel:
         for name in self.parameters:
             self.first[name] = state[f"first.{name}"].to(device)
             self.second[name] = state[f"second.{name}"].to(device)
-            self.parameters[name] = state[f"parameter.{name}"].to(device).requires_grad_()
+            self.parameters[name] = state[f"parameter.{name}"].to(device)
         self.steps = int(state["steps"])
 
 
@@ -242,24 +296,30 @@ class Exposure:
     def __init__(self, count: int, device: torch.device) -> None:
         self.delta = torch.zeros(count, 3, 4, device=device)
         self.first, self.second = torch.zeros_like(self.delta), torch.zeros_like(self.delta)
-        self._row: Tensor | None = None
 
     def apply(self, image: Tensor, alpha: Tensor, index: int) -> Tensor:
         """Change an image [H, W, 3] before black with opacity [H, W] as photograph ``index``."""
-        self._row = self.delta[index].clone().requires_grad_()
-        return image + image @ self._row[:, :3].T + alpha[..., None] * self._row[:, 3]
+        row = self.delta[index]
+        return image + image @ row[:, :3].T + alpha[..., None] * row[:, 3]
 
-    def penalty(self) -> Tensor:
-        """Distance from the identity of the photograph applied last."""
-        assert self._row is not None
-        return _PULL * self._row.square().sum()
+    def adjoint(
+        self, slope: Tensor, image: Tensor, alpha: Tensor, index: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients behind :meth:`apply`, whose result has the gradient ``slope`` [H, W, 3].
 
-    @torch.no_grad()
-    def step(self, index: int, visits: int, progress: float) -> None:
-        """One Adam step of the photograph applied last; ``visits`` counts from 1."""
-        if self._row is None or self._row.grad is None:
-            return
-        gradient = self._row.grad
+        Returns:
+            Those of the image, of the opacity, and of the row, [3, 4], where the squared distance
+            from the identity is penalised.
+        """
+        row = self.delta[index]
+        flat = slope.reshape(-1, 3)
+        turn = flat.T @ image.reshape(-1, 3)
+        shift = flat.T @ alpha.reshape(-1, 1)
+        gradient = torch.cat([turn, shift], 1) + 2.0 * _PULL * row
+        return slope + slope @ row[:, :3], slope @ row[:, 3], gradient
+
+    def step(self, gradient: Tensor, index: int, visits: int, progress: float) -> None:
+        """One Adam step of a photograph's row by its gradient; ``visits`` counts from 1."""
         first, second = self.first[index], self.second[index]
         first.lerp_(gradient, 1.0 - _BETAS[0])
         second.mul_(_BETAS[1]).addcmul_(gradient, gradient, value=1.0 - _BETAS[1])
@@ -267,7 +327,6 @@ class Exposure:
         rate = _RATE * _RATE_END**progress / (1.0 - _BETAS[0] ** visits)
         self.delta[index].addcdiv_(first, scale, value=-rate)
         self.delta -= self.delta.mean(0)
-        self._row = None
 
     def state(self) -> dict[str, Tensor]:
         """What must be saved."""

@@ -33,13 +33,12 @@ from gsfluent.pipeline.reconstruct.density import (
     draws,
 )
 from gsfluent.pipeline.reconstruct.floaters import CleanLimits, floating
-from gsfluent.pipeline.reconstruct.model import Exposure, SplatModel
+from gsfluent.pipeline.reconstruct.model import Exposure, Pulls, SplatModel
 from gsfluent.pipeline.reconstruct.recipe import Recipe
 from gsfluent.pipeline.reconstruct.target import ErrorTarget
 
 _HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
-_NEEDLE = 6.0  # longest over middle axis before it is pulled back
 _SWEEPS = (0.3, 0.5, 0.7, 0.85)  # of an object's run: what hangs before its skin is swept away
 _SWEPT = CleanLimits(depth=0.01)  # closer than cleaning at the end, since the rest can still learn
 _RESTRAIN_EVERY = 10  # steps
@@ -192,44 +191,54 @@ class Trainer:
         return min(self.settings.sh_degree, int(step / self.settings.sh_every))
 
     def _step(self, step: int) -> None:
-        """One photograph: loss, gradients, Adam."""
-        model, settings = self.model, self.settings
+        """One photograph: loss, gradients, Adam.
+
+        Adjoints are called by hand: autograd's part of a step took longer on a GPU than its
+        kernels.
+        """
+        model, settings, slot = self.model, self.settings, step % _RECENT
         index, view = self._view(step)
+        splats = model.activated(self.degree(step))
         probe = self.density.probe(model)
-        rendered = model.render(view, self.degree(step), probe, absgrad=self.density.absgrad)
-        image, masked = rendered.image, view.mask is not None
+        drawn = model.record(view, splats, probe, absgrad=self.density.absgrad)
+        image, alpha, masked = drawn.rendered.image, drawn.rendered.alpha, view.mask is not None
         if self.exposure is not None:
-            cover = rendered.alpha if masked else torch.ones_like(rendered.alpha)
+            cover = alpha if masked else torch.ones_like(alpha)
             image = self.exposure.apply(image, cover, index)
-        photometric = ops.photometric_loss(
+        found, of_image, of_alpha = ops.photometric_slopes(
             image,
             view.color,
             valid=view.valid,
-            alpha=rendered.alpha if masked else None,
+            alpha=alpha if masked else None,
             mask=view.mask,
             backdrop=self.backdrops[step] if masked else None,
             mask_weight=_MASK_WEIGHT if masked else 0.0,
         )
-        loss = photometric.loss
-        if settings.scale_regularization > 0:
-            loss = loss + settings.scale_regularization * shape_loss(model)
-        penalty = self.density.penalty(model)
-        if penalty is not None:
-            loss = loss + penalty
-        if self.exposure is not None:
-            loss = loss + self.exposure.penalty()
-        loss.backward()
-        with torch.no_grad():
-            self.last[index] = photometric.mse
-            self.recent[:, step % _RECENT] = torch.stack([loss.detach(), photometric.mse])
-        self.density.observe(rendered, probe, view)
         progress = step / settings.iterations
-        model.step(progress)
+        if self.exposure is not None:
+            of_image, more, row = self.exposure.adjoint(
+                of_image, drawn.rendered.image, cover, index
+            )
+            of_alpha = None if of_alpha is None else of_alpha + more
+            self.exposure.step(row, index, step // len(self.views) + 1, progress)
+        self.last[index] = found.mse
+        self.recent[0, slot], self.recent[1, slot] = found.loss, found.mse
+        slopes = drawn.adjoint(of_image, of_alpha)
+        gradients = model.gradients(splats, slopes, self._pulls(), self.recent[0, slot])
+        self.density.observe(drawn.rendered.radii, slopes.probe, view)
+        model.step(gradients, progress)
         if self.place.hull is not None:
             clamp_aspect(model)
-        if self.exposure is not None:
-            self.exposure.step(index, step // len(self.views) + 1, progress)
         self.density.after_step(model, step + 1)
+
+    def _pulls(self) -> Pulls:
+        """Penalties: small scales (GaussianFluent's equation 1), no needles, and the density's.
+
+        The mean of the scales keeps its weight independent of the count. Needles are penalised
+        because they swing widely when the matter they ride on turns.
+        """
+        pulls, weight = self.density.pulls(self.model), self.settings.scale_regularization
+        return pulls._replace(size=pulls.size + 0.5 * weight, needle=0.002 * weight)
 
     def _look(self) -> float:
         """Read the last losses back; returns the mean squared error of the last 30 steps."""
@@ -277,22 +286,6 @@ class Trainer:
         self.done = int(state["done"])
         self.order = []
         self.history = [(int(a), int(b), c) for a, b, c in state["history"].tolist()]
-
-
-def shape_loss(model: SplatModel) -> Tensor:
-    """Mean scale in units of the extent, and the excess of needles over an aspect of 6.
-
-    GaussianFluent's equation 1 asks for small scales; the mean keeps its weight independent of the
-    count. Needles are penalised because they swing widely when the matter they ride on turns.
-    """
-    scales = model.scales()
-    size = 0.5 * scales.mean() / model.extent
-    if model.isotropic:
-        return size
-    longest = scales.amax(1)
-    middle = scales.sum(1) - longest - scales.amin(1)
-    aspect = longest / middle.clamp_min(1e-9)
-    return size + 0.002 * (aspect - _NEEDLE).clamp_min(0.0).mean()
 
 
 def decibels(mean_squared_error: float) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsfluent import demo
+from gsfluent import demo, ops
 from gsfluent.data import BACKGROUND, SURFACE, Capture, Gaussians
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import load_capture, save_image
@@ -17,6 +17,7 @@ from gsfluent.pipeline.capture.views import TrainView, halved, read_views
 from gsfluent.pipeline.reconstruct.init import hull_gaussians
 from gsfluent.pipeline.reconstruct.isolate import Isolate, find_plane
 from gsfluent.pipeline.reconstruct.masks import refined_mask
+from gsfluent.pipeline.reconstruct.model import SplatModel
 from gsfluent.pipeline.reconstruct.stage import Reconstruct
 
 
@@ -272,10 +273,14 @@ def test_empty_masks_are_refused(table: Capture, tmp_path: Path) -> None:
 def test_a_diverged_loss_names_the_step(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = Reconstruct(iterations=5, image_size=64, start_gaussians=300)
 
-    def broken(model: object) -> torch.Tensor:
-        return torch.tensor(float("nan"))
+    activated = SplatModel.activated
 
-    monkeypatch.setattr("gsfluent.pipeline.reconstruct.train.shape_loss", broken)
+    def broken(model: SplatModel, degree: int) -> ops.activation.Activated:
+        splats = activated(model, degree)
+        splats.scales[7] = float("nan")
+        return splats
+
+    monkeypatch.setattr(SplatModel, "activated", broken)
     with pytest.raises(RunError, match="loss became nan at step 0"):
         stage(capture)
 

@@ -63,12 +63,12 @@ def camera(turn: float = 0.0) -> TrainView:
 
 
 def photographed(model: SplatModel, view: TrainView) -> TrainView:
-    color = model.render(view, 0).image.detach()
+    color = model.render(view, 0).image
     return TrainView(color, None, None, view.viewmat, view.K, SIZE)
 
 
 def picture(model: SplatModel) -> Tensor:
-    return model.render(camera(), 0).image.detach()
+    return model.render(camera(), 0).image
 
 
 @pytest.fixture(scope="module")
@@ -157,7 +157,7 @@ def test_error_is_attributed_to_where_it_is() -> None:
     views = [photographed(model, camera(turn)) for turn in (0.0, 0.8)]
     error, weight = attributed(model, views, 0)
     assert float(error.max()) < 1e-12 and float(weight.sum()) > 0
-    alpha = sum(float(model.render(view, 0).alpha.detach().sum()) for view in views)
+    alpha = sum(float(model.render(view, 0).alpha.sum()) for view in views)
     assert float(weight.sum()) == pytest.approx(alpha, rel=1e-4)
     model.parameters["sh0"].detach()[7] += 1.0
     error, weight = attributed(model, views, 0)
@@ -202,14 +202,28 @@ def test_exposure_is_the_identity_where_photographs_agree() -> None:
     gains = torch.tensor([0.8, 1.0, 1.2])
     for visit in range(1, 401):
         for index in range(3):
-            changed = exposure.apply(image, alpha, index)
-            loss = (changed - image * gains[index]).square().mean() + exposure.penalty()
-            loss.backward()
-            exposure.step(index, visit, 0.0)
+            miss = exposure.apply(image, alpha, index) - image * gains[index]
+            *_, row = exposure.adjoint(2.0 * miss / miss.numel(), image, alpha, index)
+            exposure.step(row, index, visit, 0.0)
     assert float(exposure.delta.mean(0).abs().max()) < 1e-6  # no drift of all together
     assert float(exposure.delta[0, :, :3].diagonal().mean()) < -0.05
     assert float(exposure.delta[2, :, :3].diagonal().mean()) > 0.05
     assert float(exposure.delta[1].abs().max()) < 0.02
+
+
+def test_exposure_has_the_gradients_of_autograd() -> None:
+    exposure = Exposure(2, torch.device("cpu"))
+    exposure.delta = torch.randn(2, 3, 4, dtype=torch.float64)
+    image = torch.rand(5, 7, 3, dtype=torch.float64, requires_grad=True)
+    alpha = torch.rand(5, 7, dtype=torch.float64, requires_grad=True)
+    row = exposure.delta[1].clone().requires_grad_()
+    slope = torch.randn(5, 7, 3, dtype=torch.float64)
+    changed = image + image @ row[:, :3].T + alpha[..., None] * row[:, 3]
+    loss = (changed * slope).sum() + 1e-2 * row.square().sum()
+    assert torch.allclose(exposure.apply(image, alpha, 1), changed)
+    found = exposure.adjoint(slope, image.detach(), alpha.detach(), 1)
+    for got, want in zip(found, torch.autograd.grad(loss, (image, alpha, row)), strict=True):
+        assert torch.allclose(got, want)
 
 
 def test_exposure_of_consistent_photographs_stays_small(capture: Capture) -> None:
