@@ -7,8 +7,8 @@ __getattr__, __dir__, __all__ = room(
     behind="Behind held_here",
     digests="Journal require_intact",
     frames=(
-        "DUST SavedFrame count_frames frame_head frame_path frame_positions frame_rate "
-        "frame_time load_frame packed_frame save_frame write_frame"
+        "DUST FrameWriter SavedFrame count_frames frame_head frame_path frame_positions frame_rate "
+        "frame_time load_frame packed_frame save_frame"
     ),
     lock="locked",
     partition="FILE SavedBody SavedPartition SavedSplit load_partition save_partition",

@@ -2,7 +2,8 @@
 
 One uncompressed ``.npz`` per frame, about 50 bytes a Gaussian plus 6 a colour coefficient. Centres
 and sizes keep full precision, since pictures and exports hang on them; what only tints a picture is
-stored in half precision.
+stored in half precision. What has not changed since an earlier frame is not stored again: the head
+says which frame's file holds it (:class:`FrameWriter`).
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _POINTS = ("positions", "volumes", "damage", "fragments", "velocity", "body", "m
 _DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RecursionError, OverflowError)
 _LED = ("led_rows", "led_positions")
 _DUST = "dust_rows"
+_KEPT = "kept"
 DUST = 1 << 60
 """Numbers of the splats of dust begin here, beyond all others."""
 
@@ -92,7 +94,7 @@ def save_frame(folder: Path, frame: SavedFrame) -> Path:
     Raises:
         RunError: The disk is full.
     """
-    return write_frame(folder, frame.index, packed_frame(frame))
+    return _write(folder, frame.index, packed_frame(frame))
 
 
 def packed_frame(frame: SavedFrame) -> dict[str, np.ndarray]:
@@ -118,12 +120,64 @@ def packed_frame(frame: SavedFrame) -> dict[str, np.ndarray]:
     return arrays
 
 
-def write_frame(folder: Path, index: int, arrays: dict[str, np.ndarray]) -> Path:
-    """Write what :func:`packed_frame` made, atomically.
+class FrameWriter:
+    """Writes the frames of one folder, one after the other, each array once while it stays.
+
+    Args:
+        folder: Where.
+        begun: Frames that are there; the next ones go on from them, file by file the same as if
+            nothing had come between.
 
     Raises:
-        RunError: The disk is full.
+        RunError: The last of them is damaged.
     """
+
+    def __init__(self, folder: Path, begun: int = 0) -> None:
+        self._folder = folder
+        self._stored: dict[str, tuple[int, np.ndarray]] = {}
+        if begun == 0:
+            return
+        last = begun - 1
+        try:
+            arrays = _arrays(folder, last)
+            where = _kept(_head(arrays), last)
+        except _DAMAGE as error:
+            raise _unreadable(frame_path(folder, last), error) from error
+        for name, array in arrays.items():
+            if name != "head":
+                self._stored[name] = where.get(name, last), array
+
+    def write(self, index: int, arrays: dict[str, np.ndarray]) -> Path:
+        """Write what :func:`packed_frame` made, atomically.
+
+        Raises:
+            RunError: The disk is full.
+        """
+        new, stored, kept = dict[str, np.ndarray](), dict(self._stored), dict[str, int]()
+        for name, array in arrays.items():
+            if name == "head":
+                continue
+            if name in stored and stored[name][0] < index and _same(stored[name][1], array):
+                kept[name] = stored[name][0]
+            else:
+                new[name], stored[name] = array, (index, array)
+        head = json.loads(str(arrays["head"])) | ({_KEPT: kept} if kept else {})
+        path = _write(self._folder, index, new | {"head": np.array(json.dumps(head))})
+        self._stored = stored
+        return path
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two arrays hold the same bits."""
+    alike = one.dtype == other.dtype and one.shape == other.shape
+    return alike and np.array_equal(_bits(one), _bits(other))
+
+
+def _bits(array: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
+def _write(folder: Path, index: int, arrays: dict[str, np.ndarray]) -> Path:
     path = frame_path(folder, index)
     with atomic_path(path, synced=False) as part, part.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -138,7 +192,7 @@ def load_frame(folder: Path, index: int) -> SavedFrame:
     """
     path = frame_path(folder, index)
     try:
-        arrays = _finite(read_npz(path))
+        arrays = _finite(_arrays(folder, index))
         head = _head(arrays)
         return SavedFrame(
             index=head["index"],
@@ -162,9 +216,36 @@ def frame_positions(folder: Path, index: int) -> Tensor:
     """
     path = frame_path(folder, index)
     try:
-        return _tensor(_finite(read_npz(path, ("positions",)))["positions"])
+        return _tensor(_finite(_arrays(folder, index, "positions"))["positions"])
     except _DAMAGE as error:
         raise _unreadable(path, error) from error
+
+
+def _arrays(folder: Path, index: int, *names: str) -> dict[str, np.ndarray]:
+    """The arrays of a frame, or those of ``names`` only, also such as earlier frames' files hold.
+
+    Raises:
+        ValueError: A file is missing or damaged; also an :class:`InputError`.
+        LookupError: A name is in none.
+    """
+    path = frame_path(folder, index)
+    elsewhere = _kept(_head(read_npz(path, ("head",))), index)
+    arrays = read_npz(path, [name for name in names if name not in elsewhere] if names else None)
+    earlier: dict[int, list[str]] = {}
+    for name in names or elsewhere:
+        if name in elsewhere:
+            earlier.setdefault(elsewhere[name], []).append(name)
+    for number, there in earlier.items():
+        arrays |= _arrays(folder, number, *there)
+    return arrays
+
+
+def _kept(head: dict[str, Any], index: int) -> dict[str, int]:
+    """Arrays that are in the files of earlier frames, with their numbers."""
+    kept = head.get(_KEPT, {})
+    if not all(type(n) is int and 0 <= n < index for n in dict(kept).values()):
+        raise ValueError(f"its head has arrays in frames {short(kept)}")
+    return dict(kept)
 
 
 def _finite(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.stage import Moment, Simulate, SimulationFrame
 from gsfluent.results.behind import Behind
-from gsfluent.results.frames import SavedFrame, count_frames, packed_frame, write_frame
+from gsfluent.results.frames import FrameWriter, SavedFrame, count_frames, packed_frame
 from gsfluent.results.partition import FILE as PARTITION
 from gsfluent.results.partition import save_partition
 from gsfluent.results.store import content_digest
@@ -195,13 +195,17 @@ def simulate_stage(context: RunContext) -> None:
                 save_partition(folder, partition)
             written = grown
 
-        saved_at, cost = time.monotonic(), 0.0
+        saved_at, cost, frame_files = (
+            time.monotonic(),
+            0.0,
+            FrameWriter(folder, frames.run.next_frame),
+        )
 
         def finish(moment: Moment) -> None:
             """Wrap up a frame, while the run goes on to the next ones."""
             nonlocal saved_at, cost
             frame = moment.frame()
-            files.do(write_frame, folder, frame.index, packed_frame(saved(frame, scene)))
+            files.do(frame_files.write, frame.index, packed_frame(saved(frame, scene)))
             strikes.see(frame)
             begun = time.monotonic()
             if begun - saved_at >= PATIENCE * cost:

@@ -74,7 +74,7 @@ def test_thin_walls_are_told_before_anything_moves(
     def full(*_: Any) -> None:
         raise RunError("the disk is full")
 
-    monkeypatch.setattr("gsfluent.stages.simulate.write_frame", full)
+    monkeypatch.setattr("gsfluent.results.frames.FrameWriter.write", full)
     assert main(["run", str(hard), "-o", str(hard.parent / "out")]) != 0
     said = capsys.readouterr().err
     assert "ball: 100 % of the surface stands on walls under 3 cells" in said
