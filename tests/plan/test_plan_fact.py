@@ -146,7 +146,7 @@ def test_a_run_where_nothing_can_be_had_in_a_second_teaches(
     shot: Shot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(quick, "quick_model", lambda device: None)  # as on a GPU
+    monkeypatch.setattr(quick, "quick_model", lambda device: None)  # no reference
     section = run_shot(shot, tmp_path / "out")["plan"]
     assert section["calibrated"] is False
     assert section["predicted"]["seconds"] is None and section["actual"]["seconds"] > 0.0
@@ -160,21 +160,31 @@ def test_a_run_where_nothing_can_be_had_in_a_second_teaches(
         assert 0.2 < plan["stages"][name]["seconds"] / took["seconds"] < 5.0
 
 
+@pytest.mark.parametrize("device", sorted(quick.REFERENCE))
 def test_costs_of_the_reference_go_at_the_pace_of_this_machine(
-    monkeypatch: pytest.MonkeyPatch,
+    device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = json.loads(quick.REFERENCE.read_text(encoding="utf-8"))
+    known = json.loads(quick.REFERENCE[device].read_text(encoding="utf-8"))
     assert set(known["seconds"]) == set(quick.STAGE_PIECES)
     pace = {"solve": 2.0, "draw": 3.0, "arrays": 5.0}
     here = {name: factor * known["pieces"][name] for name, factor in pace.items()}
-    monkeypatch.setattr(quick, "pieces", lambda: here)
-    made = quick.quick_model("cpu")
+    monkeypatch.setattr(quick, "pieces", lambda device: here)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda device: "another GPU")
+    made = quick.quick_model(device)
     assert made is not None and not made.measured
+    assert made.memory == known.get("memory", {})
     for stage, piece in quick.STAGE_PIECES.items():
         for feature, cost in known["seconds"][stage].items():
             wanted = cost * pace["arrays" if feature == "start" else piece]
             assert made.seconds[stage][feature] == pytest.approx(wanted)
-    assert quick.quick_model("cuda") is None
+    assert quick.quick_model("meta") is None
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_a_look_takes_every_piece(device: str) -> None:
+    found = quick.pieces(device)
+    assert set(found) == set(quick.STAGE_PIECES.values())
+    assert all(seconds > 0.0 for seconds in found.values())
 
 
 def test_a_crowded_machine_teaches_nothing_slow(shot: Shot, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
-"""Costs of a reference machine, for the first plan on any other: ``gsfluent/plan/reference.json``.
+"""Costs of a reference machine, for the first plan on any other: ``gsfluent/plan/reference*.json``.
 
-python scripts/study/shots/reference.py       # a minute
+python scripts/study/shots/reference.py                   # a minute
+python scripts/study/shots/reference.py --device cuda
 
-One thread works, and its CPU seconds are taken for the time: others may be at work.
+On a CPU one thread works, and its CPU seconds are taken for the time: others may be at work.
 """
 
 from __future__ import annotations
@@ -23,15 +24,18 @@ from gsfluent.plan.quick import REFERENCE, pieces
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("-o", "--output", type=Path, default=REFERENCE)
+    parser.add_argument("--device", choices=sorted(REFERENCE), default="cpu")
+    parser.add_argument("-o", "--output", type=Path, default=None)
     options = parser.parse_args(arguments)
-    time.perf_counter = time.process_time  # what every stage asks for its time
-    model = calibrate("cpu")
-    found = pieces()
-    write_json(options.output, {
-        "processor": processor(), "threads": model.machine["threads"], "made": model.made,
+    if options.device == "cpu":
+        time.perf_counter = time.process_time  # what every stage asks for its time
+    model = calibrate(options.device)
+    found = pieces(options.device)
+    where = model.machine.get("gpu", processor())
+    write_json(options.output or REFERENCE[options.device], {
+        "processor": where, "threads": model.machine["threads"], "made": model.made,
         "pieces": found, "seconds": model.seconds, "errors": model.errors,
-    })  # fmt: skip
+    } | ({"memory": model.memory} if model.memory else {}))  # fmt: skip
     return 0
 
 
