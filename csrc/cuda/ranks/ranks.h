@@ -60,6 +60,11 @@ struct Fleet {
     f(views[count], stream[count]);
   }
 
+  // The first rank on the device of the view of all.
+  int beside_all() const {
+    return static_cast<int>(std::find(device, device + count, device[count]) - device);
+  }
+
  private:
   // Whether r is the first rank on its device.
   bool first_there(int r) const {
