@@ -41,6 +41,8 @@ CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
 RADIUS_MOST = 0.5
 """Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
+_MANY = 500_000
+"""Points from which a step without work takes a GPU longer than the host to look at the clock."""
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -502,8 +504,11 @@ class Solver(SolverState):
         if now["dt"] > 0.0:
             left = min(left, (now["until"] - now["time"]) / now["dt"])
         left = min(left, 4096.0)
-        built = now["builds"] / max(now["step"], 1.0)  # rounds end early for new blocks
-        return math.ceil(left * (1.0 / self.steps_per_round + 0.6 * min(built, 1.0))) + 1
+        built = min(now["builds"] / max(now["step"], 1.0), 1.0)  # rounds end early for new blocks
+        each = 1.0 / self.steps_per_round
+        if self.count > _MANY:  # rounds with nothing to do take longer than another look
+            return max(1, math.floor(left * (each + 0.5 * built)))
+        return math.ceil(left * (each + 0.6 * built)) + 1
 
     def _grow(self, now: dict[str, float]) -> None:
         """Make room for more blocks; every present value is kept."""
