@@ -1,7 +1,7 @@
 """Time the solver of this checkout beside an earlier one, in turn on one machine.
 
 git worktree add build/before COMMIT       # and build it there: python setup.py build_ext --inplace
-python scripts/bench/before.py build/before --most 1.02
+python scripts/bench/solver/before.py build/before --most 1.02
 
 Both run scripts/bench/mpm.py of this checkout, each time in a process of its own, one after the
 other, and again: what the machine does meanwhile falls on both. A row's figure is the median over
@@ -20,7 +20,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parents[3]
 
 
 def rows_of(checkout: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
