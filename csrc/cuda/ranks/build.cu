@@ -60,10 +60,21 @@ __global__ void __launch_bounds__(kCutThreads)
     high[threadIdx.x] = -kBlockRange;
   }
   __syncthreads();
-  for (int64_t i = threadIdx.x; i < 3 * count; i += kCutThreads) {
-    const int32_t at = homes.coord[4 * (i / 3) + i % 3];
-    if (at < low[i % 3]) atomicMin(low + i % 3, at);
-    if (at > high[i % 3]) atomicMax(high + i % 3, at);
+  const int4* blocks = reinterpret_cast<const int4*>(homes.coord);
+  int least[3] = {kBlockRange, kBlockRange, kBlockRange};
+  int most[3] = {-kBlockRange, -kBlockRange, -kBlockRange};
+#pragma unroll 4
+  for (int64_t h = threadIdx.x; h < count; h += kCutThreads) {
+    const int4 b = blocks[h];
+    const int at[3] = {b.x, b.y, b.z};
+    for (int i = 0; i < 3; ++i) {
+      least[i] = min(least[i], at[i]);
+      most[i] = max(most[i], at[i]);
+    }
+  }
+  for (int i = 0; i < 3; ++i) {
+    atomicMin(low + i, __reduce_min_sync(kAllLanes, least[i]));
+    atomicMax(high + i, __reduce_max_sync(kAllLanes, most[i]));
   }
   __syncthreads();
   int axis[3] = {0, 1, 2};  // longest first
@@ -74,15 +85,18 @@ __global__ void __launch_bounds__(kCutThreads)
       axis[i + 1] = axis[i];
       axis[i] = longer;
     }
-  const int64_t layers = min(extent(0), int64_t(kBins));
-  const int64_t rows = min(extent(1), kBins / layers);
-  const auto bin = [&](int64_t h) {
-    const int32_t* c = homes.coord + 4 * h;
-    return (c[axis[0]] - low[axis[0]]) * layers / extent(0) * rows +
-           (c[axis[1]] - low[axis[1]]) * rows / extent(1);
+  // 32 bits hold them: blocks lie in a range of 2^17, and there are at most 2^12 bins.
+  const uint32_t extents[2] = {uint32_t(extent(0)), uint32_t(extent(1))};
+  const uint32_t layers = min(extents[0], uint32_t(kBins));
+  const uint32_t rows = min(extents[1], kBins / layers);
+  const auto bin = [&](const int4& b) {
+    const int c[3] = {b.x, b.y, b.z};
+    return uint32_t(c[axis[0]] - low[axis[0]]) * layers / extents[0] * rows +
+           uint32_t(c[axis[1]] - low[axis[1]]) * rows / extents[1];
   };
+#pragma unroll 4
   for (int64_t h = threadIdx.x; h < count; h += kCutThreads)
-    atomicAdd(filled + bin(h), homes.count[h]);
+    atomicAdd(filled + bin(blocks[h]), homes.count[h]);
   __syncthreads();
   // Points before each bin.
   constexpr int kEach = kBins / kCutThreads;
@@ -100,14 +114,15 @@ __global__ void __launch_bounds__(kCutThreads)
   for (int i = 0; i < kEach; ++i) {
     const int here = filled[kEach * threadIdx.x + i];
     filled[kEach * threadIdx.x + i] = before;
+    if (here > 0) atomicAdd(points_of + int64_t(before) * s.ranks / s.total, here);
     before += here;
   }
   __syncthreads();
   for (int64_t h = threadIdx.x; h < count; h += kCutThreads) {
-    const int32_t rank = static_cast<int32_t>(int64_t(filled[bin(h)]) * s.ranks / s.total);
+    const int32_t rank = static_cast<int32_t>(int64_t(filled[bin(blocks[h])]) * s.ranks / s.total);
     s.home_rank[h] = rank;
-    atomicAdd(points_of + rank, homes.count[h]);
-    atomicAdd(homes_of_rank + rank, 1);
+    const unsigned alike = __match_any_sync(__activemask(), rank);
+    if (int(threadIdx.x % 32) == __ffs(alike) - 1) atomicAdd(homes_of_rank + rank, __popc(alike));
   }
   __syncthreads();
   for (int r = threadIdx.x; r < s.ranks; r += kCutThreads) {
@@ -277,6 +292,7 @@ __global__ void __launch_bounds__(kThreads) hold_kernel(const __grid_constant__ 
   const int64_t site = i / kNeighbours;
   if (!may_build(*s.clock) || site >= s.clock->sites) return;
   const int32_t* slots = s.site_slots + kSiteFields * site;
+  if (slots[1] < 0 && i % kNeighbours != 0) return;  // one field: nobody reads around it
   uint64_t ranks = 0;
   int count = 0;
   for (; count < kSiteFields && slots[count] >= 0; ++count) ranks |= s.needers[slots[count]];
