@@ -88,10 +88,9 @@ enum SolverFloat : int {
   kFlip,
   kSolverFloats
 };
-constexpr int64_t kMostRanks = 64;
 constexpr int64_t kViewBytes = 1024;  // room for a view
 static_assert(sizeof(SolverView<double>) <= kViewBytes);
-enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kRanks, kSolverInts };
+enum SolverInt : int { kFields, kImplicit, kIrreversible, kLawSet, kRanks, kTotal, kSolverInts };
 
 template <class Backend>
 struct SolverOps {
@@ -111,6 +110,7 @@ struct SolverOps {
     std::memset(static_cast<void*>(&s), 0, sizeof s);
     const Tensor& like = b[kOffset];
     s.count = b[kId].numel();
+    s.total = ints[kTotal];
     s.home_capacity = b[kHomeStart0].size(0);
     s.slot_capacity = b[kSlotNext].size(0);
     s.table_size = b[kKey].size(0);
@@ -120,6 +120,7 @@ struct SolverOps {
                     "solver: the hash table must have a power of two entries");
     const ScalarType real = like.scalar_type(), i32 = ScalarType::Int, i64 = ScalarType::Long;
     const bool device = like.is_cuda();
+    const bool several = device && ints[kRanks] > 1;  // the view of all needs no scratch then
     const int64_t n = s.count, h = s.home_capacity, c = s.slot_capacity, t = s.table_size;
     const ScalarType sum = device ? i64 : ScalarType::Double, moment = device ? i64 : real;
     const struct {
@@ -139,9 +140,9 @@ struct SolverOps {
         {"peak", n, 1, real, true},
         {"deformation", n, 9, real, true},
         {"id", n, 1, i32, false},
-        {"spare", n, 9, real, false},
-        {"entry", n, 1, i32, false},
-        {"place", n, 1, i32, false},
+        {"spare", n, 9, real, several},
+        {"entry", n, 1, i32, several},
+        {"place", n, 1, i32, several},
         {"law", s.row_count, 1, i32, false},
         {"rows", s.row_count, kRowColumns, real, false},
         {"home_coord0", h, 4, i32, false},
@@ -173,7 +174,7 @@ struct SolverOps {
         {"impulse", s.collider_count, kImpulseSums, ScalarType::Double, true},
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
-        {"radius", n, 1, real, true},
+        {"radius", s.total, 1, real, true},
         {"viscous", n, kViscousColumns, real, true},
         {"object", ints[kFields], 1, i32, true},
         {"own", n, 9, real, true},
@@ -392,12 +393,15 @@ struct SolverOps {
         views.push_back(view<T>(part, ints, floats));
         like.push_back(part[kOffset]);
         const SolverView<T>& s = views.back();
-        STD_TORCH_CHECK(s.count == all.count && s.home_capacity == all.home_capacity &&
-                            s.slot_capacity == all.slot_capacity &&
-                            s.table_size == all.table_size && s.row_count == all.row_count &&
+        STD_TORCH_CHECK(s.slot_capacity == all.slot_capacity && s.table_size == all.table_size &&
+                            s.row_count == all.row_count &&
                             s.collider_count == all.collider_count &&
                             (s.moments == nullptr) == (all.moments == nullptr),
-                        "solver: a rank must have the room that all have");
+                        "solver: a rank must have the room for blocks that all have");
+        STD_TORCH_CHECK(s.count > 0 && s.spare != nullptr && s.entry != nullptr &&
+                            s.place != nullptr && s.count <= int64_t(1) << place_bits(s.ranks),
+                        "solver: a rank must have room for 1 to 2^", place_bits(s.ranks),
+                        " points, got ", s.count);
       }
       views.push_back(all);
       like.push_back(b[kOffset]);
@@ -405,7 +409,6 @@ struct SolverOps {
         STD_TORCH_CHECK(s.peers != nullptr && s.holders != nullptr && s.needers != nullptr &&
                             s.mail != nullptr && s.home_rank != nullptr && s.home_place != nullptr,
                         "solver: ranks need peers, holders, needers, mail, home_rank, home_place");
-      STD_TORCH_CHECK(all.count <= int64_t(1) << 26, "solver: at most 2^26 points");
       f(std::move(views), like);
     });
   }

@@ -41,6 +41,8 @@ CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
 RADIUS_MOST = 0.5
 """Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
+_MANY = 500_000
+"""Points from which a step without work takes a GPU longer than the host to look at the clock."""
 _REASONS = {
     1: (
         "a speed, a wave speed or a strain is not finite",
@@ -56,6 +58,10 @@ _REASONS = {
         "remove points that fly away, or raise dx",
     ),
     5: ("the time step is too small for the present time to resolve", "look at the stiffest law"),
+    6: (
+        f"more than {layout.MAX_HOME} points in one block of 4 cells",
+        "take fewer points per cell, or lower dx",
+    ),
 }
 
 
@@ -406,7 +412,7 @@ class Solver(SolverState):
 
     def _settings(self) -> tuple[list[int], list[float]]:
         ints = [self.fields, int(self.implicit), int(self.irreversible), self._law_set,
-                self.ranks]  # fmt: skip
+                self.ranks, self.count]  # fmt: skip
         floats = [
             self.dx, *self.gravity, self.friction, self.restitution, self.contact_gap, self.k,
             self.epsilon, self.flip,
@@ -466,7 +472,8 @@ class Solver(SolverState):
             return
         left, goal = -1 if steps is None else steps, 1e300 if until is None else until
         # Every call starts from new blocks, so that nothing depends on what was built before it.
-        self._write(until=goal, steps_left=left, done=0, reason=0, lost=0, leaving=0, rebuild=1)
+        self._write(until=goal, steps_left=left, done=0, grow=0, reason=0, lost=0, leaving=0,
+                    rebuild=1)  # fmt: skip
         ints, floats = self._settings()
         with torch.no_grad():
             if self._parts is None:
@@ -497,17 +504,22 @@ class Solver(SolverState):
         if now["dt"] > 0.0:
             left = min(left, (now["until"] - now["time"]) / now["dt"])
         left = min(left, 4096.0)
-        built = now["builds"] / max(now["step"], 1.0)  # rounds end early for new blocks
-        return math.ceil(left * (1.0 / self.steps_per_round + 0.6 * min(built, 1.0))) + 1
+        built = min(now["builds"] / max(now["step"], 1.0), 1.0)  # rounds end early for new blocks
+        each = 1.0 / self.steps_per_round
+        if self.count > _MANY:  # rounds with nothing to do take longer than another look
+            return max(1, math.floor(left * (each + 0.5 * built)))
+        return math.ceil(left * (each + 0.6 * built)) + 1
 
     def _grow(self, now: dict[str, float]) -> None:
         """Make room for more blocks; every present value is kept."""
         b = self._whole
-        homes = max(int(1.5 * now["wanted_homes"]) + 64, b.home_start0.shape[0])
-        slots = max(int(1.5 * now["wanted_slots"]) + 64, b.slot_next.shape[0])
-        b.reserve_blocks(homes, slots, self.fields)
+        homes, slots = b.home_start0.shape[0], b.slot_next.shape[0]
+        if now["wanted_homes"] > homes or now["wanted_slots"] > slots:  # else a rank wants more
+            homes = max(int(1.5 * now["wanted_homes"]) + 64, homes)
+            slots = max(int(1.5 * now["wanted_slots"]) + 64, slots)
+            b.reserve_blocks(homes, slots, self.fields)
         if self._parts is not None:
-            self._parts.grow(homes, slots)
+            self._parts.grow()
         self._write(grow=0, rebuild=1)
 
     def rank_counts(self) -> list[dict[str, int]]:
@@ -547,7 +559,7 @@ class Solver(SolverState):
         """Go back to a :meth:`snapshot` of this solver."""
         b = self._whole
         if self._parts is not None:
-            self._parts.away = False
+            self._parts.recall()
         for name, value in saved.items():
             target = getattr(b, name)
             if target.shape == value.shape:

@@ -16,8 +16,10 @@ IMPULSE_SUMS = 7
 BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 2
 MAX_ROWS = 2**23
-MAX_PARTICLES = 2**26
-"""More could overflow the fixed-point sums (``csrc/core/solver/clock.h``)."""
+MAX_PARTICLES = 2**29
+"""Their places fit into 32 bits, on any number of ranks."""
+MAX_HOME = 2**26
+"""Points of one home; more could overflow its fixed-point sums (docs/theory/solver-sums.md)."""
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
@@ -140,7 +142,7 @@ class Buffers:
         self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         if device.type == "cuda":  # on a CPU the kernels have them
-            if self.own.numel():
+            if self.own.numel() or self.free_velocity.numel():  # points may be with ranks
                 self.free_velocity = torch.zeros_like(self.node_velocity)
             if self.radius.numel():
                 self.push, self.slot_given = torch.zeros_like(self.sums), whole(slots)
@@ -173,6 +175,18 @@ def planes(values: Tensor) -> Tensor:
     See ``csrc/core/solver/layout.h``.
     """
     return torch.cat([part.reshape(-1) for part in values.split(4, dim=1)])
+
+
+def more_room(values: Tensor, width: int, count: int) -> Tensor:
+    """Planes of ``width`` components per point with room for ``count`` points; as many as fit."""
+    values, new = values.reshape(-1), values.new_zeros(count * width)
+    old = values.numel() // width
+    kept, begin, start = min(old, count), 0, 0
+    for left in range(width, 0, -4):
+        size = min(4, left)
+        new[start : start + kept * size] = values[begin : begin + kept * size]
+        begin, start = begin + old * size, start + count * size
+    return new
 
 
 def from_planes(values: Tensor, width: int) -> Tensor:

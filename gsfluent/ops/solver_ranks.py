@@ -25,8 +25,12 @@ MAIL_WORDS = 11
 PATIENCE = 60.0
 """Wall time without a finished step after which a device counts as stalled [s]."""
 
-_POINTS = ("offset", "velocity", "strain", "alpha", "peak", "deformation", "id", "spare", "entry",
-           "place", "viscous", "own")  # fmt: skip
+_POINTS = {"offset": 4, "velocity": 12, "strain": 6, "alpha": 1, "peak": 1, "deformation": 9,
+           "id": 1, "viscous": 9, "own": 9}  # fmt: skip
+"""What ranks hold of their points, and its components."""
+_SCRATCH = {"spare": 9, "entry": 1, "place": 1}
+_POINTS_MORE, _HOMES_MORE, _A_FEW = 0.1, 0.25, 64
+"""Room for more points and homes than a rank has now, in parts of them; and for so many."""
 _MOVING = ("colliders", "collider_state", "impulse")
 _STATIC = ("law", "rows", "sdf", "parent", "cut", "radius", "object")
 
@@ -107,7 +111,14 @@ class Parts:
         self.whole, self.devices, self.fields = whole, tuple(devices), fields
         self._settings, self.away = (ints, floats), False
         self._equip(whole)
-        self.parts = [self._part(device) for device in devices]
+        self._used = {name: width for name, width in _POINTS.items()
+                      if getattr(whole, name).numel()}  # fmt: skip
+        self._count = whole.id.numel()
+        for name in _SCRATCH:  # a build's; those of the ranks do it
+            setattr(whole, name, getattr(whole, name).new_zeros(0))
+        share = -(-self._count // len(devices))
+        homes = -(-int(whole.clock[layout.INDEX["homes"]]) // len(devices))
+        self.parts = [self._part(device, share, homes) for device in devices]
 
     def _equip(self, b: layout.Buffers) -> None:
         """Room for what ranks need beside the rest."""
@@ -118,22 +129,30 @@ class Parts:
         b.peers = torch.zeros(room, dtype=torch.uint8, device=device)
         b.reserve_ranks()
 
-    def _part(self, device: torch.device) -> layout.Buffers:
+    def _part(self, device: torch.device, points: int, homes: int) -> layout.Buffers:
+        """Buffers of a rank with about so many points and homes, and for all blocks."""
         whole = self.whole
         part = dataclasses.replace(whole)
         for field in dataclasses.fields(whole):
             value = getattr(whole, field.name)
             if field.name in _STATIC:
                 new = value.to(device)
-            elif field.name in (*_POINTS, *_MOVING, "clock", "impulse_units", "spring_rows"):
+            elif field.name in (*_MOVING, "clock", "impulse_units", "spring_rows"):
                 new = torch.zeros_like(value, device=device)
             else:
                 new = value.new_zeros((0, *value.shape[1:]), device=device)
             setattr(part, field.name, new)
         part.home_start0 = part.home_start0.new_zeros(0)
-        part.reserve_blocks(whole.home_start0.shape[0], whole.slot_next.shape[0], self.fields)
+        self._make_room(part, points)
+        part.reserve_blocks(_with_room(homes, _HOMES_MORE), whole.slot_next.shape[0], self.fields)
         self._equip(part)
         return part
+
+    def _make_room(self, part: layout.Buffers, points: int) -> None:
+        """Room for so many points of a rank and some more; those that it has are kept."""
+        room = min(self._count, _with_room(points, _POINTS_MORE))
+        for name, width in (*self._used.items(), *_SCRATCH.items()):
+            setattr(part, name, layout.more_room(getattr(part, name), width, room))
 
     def _lists(self) -> tuple[list[Tensor], list[Tensor], list[int], list[float]]:
         """What the operators take: buffers of all, of one rank after the other, settings."""
@@ -146,9 +165,17 @@ class Parts:
             for name in _MOVING:
                 getattr(part, name).copy_(getattr(self.whole, name))
             part.impulse_units.zero_()
-        torch.ops.gsfluent.solver_prime_ranks(*self._lists(), not self.away)
-        self.away = True
+        load = not self.away
+        torch.ops.gsfluent.solver_prime_ranks(*self._lists(), load)
         self._wait()
+        while load and int(self.whole.clock[layout.INDEX["grow"]]):  # nothing was loaded
+            self.whole.clock[layout.INDEX["grow"]] = 0
+            self.grow()
+            torch.ops.gsfluent.solver_prime_ranks(*self._lists(), load)
+            self._wait()
+        self.away = True
+        for name in self._used:
+            setattr(self.whole, name, getattr(self.whole, name).new_zeros(0))
 
     def run(self, rounds: int, steps: int) -> None:
         """As ``solver_run``."""
@@ -189,13 +216,31 @@ class Parts:
     def gather(self) -> None:
         """Bring the points back, if they are away."""
         if self.away:
+            self.recall()
             torch.ops.gsfluent.solver_gather_ranks(*self._lists())
-            self.away = False
 
-    def grow(self, homes: int, slots: int) -> None:
-        """Make room for more blocks on every rank; ``whole`` has it already."""
+    def recall(self) -> None:
+        """Room for the points in the buffers of all; those of the ranks count no more."""
+        self.away = False
+        for name, width in self._used.items():
+            value = getattr(self.whole, name)
+            setattr(self.whole, name, layout.more_room(value, width, self._count))
+
+    def grow(self) -> None:
+        """Make room on every rank: for as many blocks as ``whole``, and for what the rank wants."""
+        slots, table = self.whole.slot_next.shape[0], self.whole.key.shape[0]
         for part in self.parts:
-            part.reserve_blocks(homes, slots, self.fields)
+            clock = part.clock.cpu()
+            points, homes = (int(clock[layout.INDEX[name]]) for name in ("cursor", "wanted_homes"))
+            room = part.home_start0.shape[0]
+            if points > part.id.numel():
+                self._make_room(part, points)
+            if homes > room and points > 0:  # else it is the table of blocks that was full
+                room = _with_room(homes, _HOMES_MORE)
+            if (room, slots, table) != (
+                part.home_start0.shape[0], part.slot_next.shape[0], part.key.shape[0]
+            ):  # fmt: skip
+                part.reserve_blocks(room, slots, self.fields)
             part.clock[layout.INDEX["grow"]] = 0
 
     def memory(self) -> int:
@@ -214,3 +259,8 @@ class Parts:
             shared = int((holders != torch.ones_like(holders) << rank).sum())
             rows.append({"points": points, "homes": homes, "slots": slots, "shared": shared})
         return rows
+
+
+def _with_room(count: int, more: float) -> int:
+    """So many, and room for some more."""
+    return count + int(more * count) + _A_FEW

@@ -6,6 +6,7 @@ python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/bench
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
 python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136
 
+With --profile too: what each GPU does in a step, kernel by kernel.
 With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the
 bits of one. The way of the points to the devices and back is in the time of each 100 steps.
 
@@ -174,6 +175,38 @@ def scaling(n: int, cells: int, counts: list[int]) -> list[dict[str, Any]]:
     return rows
 
 
+def profile(n: int, cells: int, count: int) -> str:
+    """Microseconds of a step by kernel on each of so many GPUs, and how long each was idle."""
+    devices = [f"cuda:{i}" for i in range(count)]
+    several = {"devices": devices} if count > 1 else {}
+    solver = build(n, cells, "lattice", "elastic", torch.device("cuda:0"), **several)
+    solver.advance(steps=100)
+    steps = 100
+    kinds = [torch.profiler.ProfilerActivity.CUDA]
+    with torch.profiler.profile(activities=kinds) as seen:
+        solver.advance(steps=steps)
+        for device in devices:
+            torch.cuda.synchronize(device)
+    spans: dict[int, list[tuple[float, float, str]]] = {}
+    for event in seen.events():
+        name = event.name.split("<")[0].split("::")[-1].removeprefix("void ")
+        span = (event.time_range.start, event.time_range.end, name)
+        spans.setdefault(event.device_index, []).append(span)
+    lines = [f"{solver.count:,} points, {count} GPU(s); us a step, of {steps} steps"]
+    for device, found in sorted(spans.items()):
+        total: dict[str, list[float]] = {}
+        for start, end, name in found:
+            total.setdefault(name, []).append(end - start)
+        whole = max(end for _, end, _ in found) - min(start for start, _, _ in found)
+        busy = sum(sum(times) for times in total.values())
+        lines.append(
+            f"cuda:{device}: {whole / steps:.1f}, of them idle {(whole - busy) / steps:.1f}"
+        )
+        for name, times in sorted(total.items(), key=lambda item: -sum(item[1]))[:24]:
+            lines.append(f"  {name:<28}{sum(times) / steps:9.2f}  {len(times)} times")
+    return "\n".join(lines) + "\n"
+
+
 def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
     lines = [
         f"Device: {name}; torch {torch.__version__}. Elastic, lattice. Whole steps, with builds.",
@@ -229,6 +262,7 @@ def main() -> int:
     parser.add_argument("--orders", nargs="*", default=["lattice", "random"])
     parser.add_argument("--peer", type=Path, help="what physgaussian.py wrote")
     parser.add_argument("--devices", nargs="*", type=int, help="numbers of GPUs: 1 2 4")
+    parser.add_argument("--profile", action="store_true", help="with --devices: kernel by kernel")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
@@ -248,7 +282,12 @@ def main() -> int:
         rows = []
         for text in options.rows or ["200:100", "300:136"]:
             n, cells = (int(part) for part in text.split(":"))
+            if options.profile:
+                sys.stdout.writelines(profile(n, cells, count) for count in options.devices)
+                continue
             rows += scaling(n, cells, options.devices)
+        if options.profile:
+            return 0
         name = torch.cuda.get_device_name()
         return leave(options, "bench_mpm devices", scaling_table(name, rows), name, rows)
     default = ["100:24", "200:50", "200:80", "300:100"] if gpu else ["100:24"]

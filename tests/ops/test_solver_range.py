@@ -17,7 +17,7 @@ from solver_scenes import DX, cube, elastic_row
 
 from gsfluent import ops
 from gsfluent.ops.reference import fixed_point as fixed
-from gsfluent.ops.solver_buffers import MAX_PARTICLES
+from gsfluent.ops.solver_buffers import MAX_HOME
 
 CUDA = Path(__file__).parents[2] / "csrc" / "cuda"
 KERNEL = "\n".join(p.read_text(encoding="utf-8") for p in sorted(CUDA.glob("solver/*")))
@@ -149,10 +149,10 @@ def test_all_points_at_one_node_with_the_largest_momentum_fit(count: int) -> Non
             assert largest > 2 ** (word - 5)
 
 
-def test_the_most_points_a_solver_takes_fit_into_a_window() -> None:
+def test_the_most_points_of_a_home_fit_into_a_window() -> None:
     for share in (fixed.MOMENTUM_SHARE, fixed.MASS_SHARE):
         all_words = WEIGHT / Fraction(share) * 2**fixed.WINDOW_BITS
-        assert all_words + Fraction(MAX_PARTICLES, 2) < 2**31
+        assert all_words + Fraction(MAX_HOME, 2) < 2**31
 
 
 def test_light_points_beside_heavy_ones_keep_their_velocity() -> None:

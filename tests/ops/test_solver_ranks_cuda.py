@@ -112,7 +112,7 @@ def test_order_of_points_and_room_for_blocks_leave_no_trace() -> None:
     tight = ops.Solver(**here(given), ranks=3)
     homes = int(tight.clock()["homes"])
     tight._buffers.reserve_blocks(homes, 1, 2)
-    tight._parts.grow(homes, 1)
+    tight._parts.grow()
     start = tight.snapshot()
     for _ in range(2):
         tight.advance(steps=20)
@@ -142,6 +142,25 @@ def test_points_stay_with_their_ranks_until_somebody_looks() -> None:
     assert several._parts.away
     assert_equal(several, one)
     assert not several._parts.away
+
+
+def test_each_rank_has_memory_for_its_share_and_grows_where_points_gather() -> None:
+    given = here(scene(cells=24, bodies=2, laws=(0, 1), dtype=torch.float32))
+    one, several = run(given), run(given, ranks=4)
+    room = [part.id.numel() for part in several._parts.parts]
+    assert sum(room) < 1.3 * one.count and max(room) < 0.3 * one.count
+    assert several._whole.offset.numel() == 0  # while the points are away
+    # All points drift into the share of one rank: what lies there is too small and grows.
+    for part in several._parts.parts:
+        for name, width in (*several._parts._used.items(), *solver_ranks._SCRATCH.items()):
+            held = int(part.clock[solver_ranks.layout.INDEX["cursor"]])
+            setattr(part, name, solver_ranks.layout.more_room(getattr(part, name), width, held))
+    before = [part.id.numel() for part in several._parts.parts]
+    for solver in (one, several):
+        solver.advance(steps=200)
+    assert_equal(several, one)
+    assert [part.id.numel() for part in several._parts.parts] != before
+    assert several._whole.offset.numel() > 0
 
 
 def test_the_same_failure_at_the_same_step() -> None:

@@ -51,3 +51,9 @@ def test_packed_shots_are_those_one_after_another(tmp_path: Path) -> None:
         "same_figures": True,
     }  # fmt: skip
     assert "4.00 times as fast" in packing.markdown(row)
+    rows = [
+        {"device": "GPU", "cores": 32, "gpus": n, "shots": 64, "pack": 8, "wall": 100.0 / n,
+         "same_figures": True}
+        for n in (1, 2)
+    ]  # fmt: skip
+    assert "| 2 | 50.0 | 0.78 | 2.00 | yes |" in packing.table(rows)

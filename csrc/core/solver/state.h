@@ -35,6 +35,8 @@ constexpr int kFieldBits = 12;     // fields of a scene
 constexpr int kMaxSolverFields = (1 << kFieldBits) - 1;
 constexpr int kBlockBits = 17;  // block coordinates lie in [-2^16, 2^16)
 constexpr int32_t kBlockRange = 1 << (kBlockBits - 1);
+constexpr int kMostRanks = 64;
+constexpr int32_t kMostOfHome = 1 << 26;  // points of a home whose sums fit (solver-sums.md)
 constexpr uint64_t kNoKey = ~uint64_t(0);
 
 // l and the material row of a particle in one word.
@@ -103,6 +105,7 @@ enum SolverReason : int64_t {
   kCrowded = 3,       // more than kSiteFields fields in one block
   kOutside = 4,       // a particle beyond the largest block coordinate
   kStepTooSmall = 5,  // the step fell below what time can resolve
+  kFull = 6,          // more than kMostOfHome points in one home (CUDA)
 };
 
 // What one of several ranks on CUDA tells the others at the end of a step, from its clock; then
@@ -156,7 +159,11 @@ struct HomeList {
 
 template <typename T>
 struct SolverView {
-  int64_t count, home_capacity, slot_capacity, table_size, row_count, collider_count;
+  int64_t count;  // points there is room for, the stride of their planes: all of the scene, or of
+                  // several ranks on CUDA those that one may have (none: the view of all, while its
+                  // points lie with the ranks)
+  int64_t total;  // points of the scene
+  int64_t home_capacity, slot_capacity, table_size, row_count, collider_count;
   int32_t fields;
   int32_t ranks;  // parts of the scene: on a CPU in cpu/ranks, on devices in cuda/ranks
   int32_t rank;   // CUDA, several ranks: which of them this is; `ranks` is the view of all
@@ -166,7 +173,7 @@ struct SolverView {
   NaccOptions<T> options;
   bool irreversible;
   SolverClock* clock;
-  // particles, grouped by home; shapes as on the CPU, see core/solver/layout.h
+  // particles, grouped by home (N = count); shapes as on the CPU, see core/solver/layout.h
   T* offset;       // [N, 3] o
   uint32_t* meta;  // [N]
   T* velocity;     // [N, 3] m/s
@@ -214,8 +221,8 @@ struct SolverView {
   // blades: fields of one body move as one, except on opposite sides of a blade; or null: no blade
   const int32_t* parent;  // [fields] body of each field
   const int32_t* cut;     // [fields] its sides (core/collider/blade.h)
-  // [N] contact radius of each point by its row when it was loaded (core/collider/spring.h) [m], or
-  // null: colliders hold nodes
+  // [total] contact radius of each point by its row when it was loaded (core/collider/spring.h)
+  // [m], or null: colliders hold nodes
   const T* radius;
   // [N, 9] viscosity of each point (core/material/viscous.h), or null
   T* viscous;
@@ -266,6 +273,13 @@ struct SolverView {
   GSF_HOST_DEVICE const HomeList<T>& homes() const { return home[clock->parity & 1]; }
   GSF_HOST_DEVICE const HomeList<T>& next_homes() const { return home[1 - (clock->parity & 1)]; }
 };
+
+// Bits of the place of a point on its rank in a word whose bits above it name that rank (CUDA).
+GSF_HOST_DEVICE int place_bits(int32_t ranks) {
+  int bits = 32;
+  for (int32_t most = ranks - 1; most > 0; most >>= 1) --bits;
+  return bits < 31 ? bits : 31;
+}
 
 // True while a step may run: nothing has ended, failed or asked for new blocks.
 GSF_HOST_DEVICE bool may_step(const SolverClock& c) {

@@ -41,26 +41,40 @@ __global__ void __launch_bounds__(kThreads) join_kernel(const __grid_constant__ 
 }
 
 // Cuts across the longest axis, and within a layer of blocks across the second: the rank that owns
-// each home. Each has about as many points. One CTA.
+// each home. Each has about as many points. If one has no room for its share, all stop before
+// anything has changed, and the clocks of the ranks say what they want. One CTA.
 template <typename T>
 __global__ void __launch_bounds__(kCutThreads)
     cut_kernel(const __grid_constant__ SolverView<T> s, bool build) {
-  const SolverClock& clock = *s.clock;
+  SolverClock& clock = *s.clock;
   if (build && !may_build(clock)) return;
   const HomeList<T>& homes = homes_of(s, build);
   const int64_t count = build ? clock.wanted_homes : clock.homes;
   __shared__ int low[3], high[3];
   __shared__ int filled[kBins], sums[kCutThreads];
+  __shared__ int points_of[kMostRanks], homes_of_rank[kMostRanks];
   for (int i = threadIdx.x; i < kBins; i += kCutThreads) filled[i] = 0;
+  for (int r = threadIdx.x; r < s.ranks; r += kCutThreads) points_of[r] = homes_of_rank[r] = 0;
   if (threadIdx.x < 3) {
     low[threadIdx.x] = kBlockRange;
     high[threadIdx.x] = -kBlockRange;
   }
   __syncthreads();
-  for (int64_t i = threadIdx.x; i < 3 * count; i += kCutThreads) {
-    const int32_t at = homes.coord[4 * (i / 3) + i % 3];
-    if (at < low[i % 3]) atomicMin(low + i % 3, at);
-    if (at > high[i % 3]) atomicMax(high + i % 3, at);
+  const int4* blocks = reinterpret_cast<const int4*>(homes.coord);
+  int least[3] = {kBlockRange, kBlockRange, kBlockRange};
+  int most[3] = {-kBlockRange, -kBlockRange, -kBlockRange};
+#pragma unroll 4
+  for (int64_t h = threadIdx.x; h < count; h += kCutThreads) {
+    const int4 b = blocks[h];
+    const int at[3] = {b.x, b.y, b.z};
+    for (int i = 0; i < 3; ++i) {
+      least[i] = min(least[i], at[i]);
+      most[i] = max(most[i], at[i]);
+    }
+  }
+  for (int i = 0; i < 3; ++i) {
+    atomicMin(low + i, __reduce_min_sync(kAllLanes, least[i]));
+    atomicMax(high + i, __reduce_max_sync(kAllLanes, most[i]));
   }
   __syncthreads();
   int axis[3] = {0, 1, 2};  // longest first
@@ -71,15 +85,18 @@ __global__ void __launch_bounds__(kCutThreads)
       axis[i + 1] = axis[i];
       axis[i] = longer;
     }
-  const int64_t layers = min(extent(0), int64_t(kBins));
-  const int64_t rows = min(extent(1), kBins / layers);
-  const auto bin = [&](int64_t h) {
-    const int32_t* c = homes.coord + 4 * h;
-    return (c[axis[0]] - low[axis[0]]) * layers / extent(0) * rows +
-           (c[axis[1]] - low[axis[1]]) * rows / extent(1);
+  // 32 bits hold them: blocks lie in a range of 2^17, and there are at most 2^12 bins.
+  const uint32_t extents[2] = {uint32_t(extent(0)), uint32_t(extent(1))};
+  const uint32_t layers = min(extents[0], uint32_t(kBins));
+  const uint32_t rows = min(extents[1], kBins / layers);
+  const auto bin = [&](const int4& b) {
+    const int c[3] = {b.x, b.y, b.z};
+    return uint32_t(c[axis[0]] - low[axis[0]]) * layers / extents[0] * rows +
+           uint32_t(c[axis[1]] - low[axis[1]]) * rows / extents[1];
   };
+#pragma unroll 4
   for (int64_t h = threadIdx.x; h < count; h += kCutThreads)
-    atomicAdd(filled + bin(h), homes.count[h]);
+    atomicAdd(filled + bin(blocks[h]), homes.count[h]);
   __syncthreads();
   // Points before each bin.
   constexpr int kEach = kBins / kCutThreads;
@@ -97,11 +114,24 @@ __global__ void __launch_bounds__(kCutThreads)
   for (int i = 0; i < kEach; ++i) {
     const int here = filled[kEach * threadIdx.x + i];
     filled[kEach * threadIdx.x + i] = before;
+    if (here > 0) atomicAdd(points_of + int64_t(before) * s.ranks / s.total, here);
     before += here;
   }
   __syncthreads();
-  for (int64_t h = threadIdx.x; h < count; h += kCutThreads)
-    s.home_rank[h] = static_cast<int32_t>(int64_t(filled[bin(h)]) * s.ranks / s.count);
+  for (int64_t h = threadIdx.x; h < count; h += kCutThreads) {
+    const int32_t rank = static_cast<int32_t>(int64_t(filled[bin(blocks[h])]) * s.ranks / s.total);
+    s.home_rank[h] = rank;
+    const unsigned alike = __match_any_sync(__activemask(), rank);
+    if (int(threadIdx.x % 32) == __ffs(alike) - 1) atomicAdd(homes_of_rank + rank, __popc(alike));
+  }
+  __syncthreads();
+  for (int r = threadIdx.x; r < s.ranks; r += kCutThreads) {
+    SolverClock& wants = *s.peers[r].clock;
+    wants.cursor = points_of[r];
+    wants.wanted_homes = homes_of_rank[r];
+    if (points_of[r] > s.peers[r].count || homes_of_rank[r] > s.peers[r].home_capacity)
+      clock.grow = 1;
+  }
 }
 
 // A rank hears how the build went and has no homes yet; or the clock of all, and keeps its homes.
@@ -110,6 +140,10 @@ __global__ void hear_kernel(const __grid_constant__ SolverView<T> s,
                             const __grid_constant__ SolverView<T> all, bool build) {
   SolverClock& c = *s.clock;
   if (!build) {
+    if (all.clock->grow != 0) {  // nothing is loaded; what this rank wants stands in its clock
+      c.grow = 1;
+      return;
+    }
     SolverClock now = *all.clock;
     now.homes = c.homes;
     now.slots = c.slots;
@@ -121,11 +155,12 @@ __global__ void hear_kernel(const __grid_constant__ SolverView<T> s,
   if (!may_build(c)) return;
   c.grow = all.clock->grow;
   c.reason = all.clock->reason;
+  if (c.grow != 0) return;  // likewise
   c.wanted_homes = c.wanted_slots = c.cursor = c.shared_sites = c.shared_homes = 0;
 }
 template <typename T>
 __global__ void empty_kernel(const __grid_constant__ SolverView<T> s) {
-  s.clock->wanted_homes = s.clock->cursor = s.clock->slots = 0;
+  if (s.clock->grow == 0) s.clock->wanted_homes = s.clock->cursor = s.clock->slots = 0;
 }
 
 // The homes that a rank owns.
@@ -133,7 +168,7 @@ template <typename T>
 __global__ void __launch_bounds__(kThreads)
     take_kernel(const __grid_constant__ SolverView<T> s, const __grid_constant__ SolverView<T> all,
                 bool build) {
-  if (build && !may_build(*s.clock)) return;
+  if (build ? !may_build(*s.clock) : s.clock->grow != 0) return;
   const int64_t h = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int64_t count = build ? all.clock->wanted_homes : all.clock->homes;
   if (h >= count || all.home_rank[h] != s.rank) return;
@@ -153,7 +188,7 @@ __global__ void __launch_bounds__(kThreads)
     fetch_kernel(const __grid_constant__ SolverView<T> s,
                  const __grid_constant__ SolverView<T> all) {
   const int64_t h = blockIdx.x;
-  if (h >= all.clock->homes || all.home_rank[h] != s.rank) return;
+  if (all.clock->grow != 0 || h >= all.clock->homes || all.home_rank[h] != s.rank) return;
   const int64_t first = all.homes().start[h], place = all.home_place[h];
   for (int pass = kPlacePass; pass <= kOwnPass; ++pass) {
     if (pass >= kDeformationPass && nine_of(s, pass) == nullptr) continue;
@@ -168,7 +203,7 @@ __global__ void __launch_bounds__(kThreads)
 }
 template <typename T>
 __global__ void loaded_kernel(const __grid_constant__ SolverView<T> s) {
-  s.clock->homes = s.clock->wanted_homes;
+  if (s.clock->grow == 0) s.clock->homes = s.clock->wanted_homes;
 }
 
 // As place_kernel: where each point of a rank goes, rank and place in one word.
@@ -179,6 +214,7 @@ __global__ void __launch_bounds__(kThreads) send_kernel(const __grid_constant__ 
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   const int32_t* coord = s.homes().coord + 4 * blockIdx.x;
   const int64_t first = s.homes().start[blockIdx.x], count = s.homes().count[blockIdx.x];
+  const int bits = place_bits(s.ranks);
   for (int64_t r = threadIdx.x; r < count; r += kThreads) {
     const int64_t p = first + r;
     const int32_t e = s.entry[p], h = all.table_home[s.table_home[e]];
@@ -189,7 +225,7 @@ __global__ void __launch_bounds__(kThreads) send_kernel(const __grid_constant__ 
     for (int axis = 0; axis < 3; ++axis)
       l[axis] = 4 * (coord[axis] - to[axis]) + meta_cell(meta, axis);
     store_meta(s, p, pack_meta(l[0], l[1], l[2], meta_row(meta)));
-    s.entry[p] = static_cast<int32_t>(uint32_t(all.home_rank[h]) << kPlaceBits | uint32_t(at));
+    s.entry[p] = static_cast<int32_t>(uint32_t(all.home_rank[h]) << bits | uint32_t(at));
   }
 }
 
@@ -199,10 +235,11 @@ __global__ void __launch_bounds__(kThreads) offer_kernel(const __grid_constant__
   const SolverClock& clock = *s.clock;
   if (!may_build(clock) || int64_t(blockIdx.x) >= clock.homes) return;
   const int64_t first = s.homes().start[blockIdx.x], count = s.homes().count[blockIdx.x];
+  const int bits = place_bits(s.ranks);
   for (int64_t r = threadIdx.x; r < count; r += kThreads) {
     int64_t at;
     const SolverView<T>& to = holder(s, s.entry[first + r], at);
-    to.place[at] = static_cast<int32_t>(uint32_t(s.rank) << kPlaceBits | uint32_t(first + r));
+    to.place[at] = static_cast<int32_t>(uint32_t(s.rank) << bits | uint32_t(first + r));
   }
 }
 
@@ -255,6 +292,7 @@ __global__ void __launch_bounds__(kThreads) hold_kernel(const __grid_constant__ 
   const int64_t site = i / kNeighbours;
   if (!may_build(*s.clock) || site >= s.clock->sites) return;
   const int32_t* slots = s.site_slots + kSiteFields * site;
+  if (slots[1] < 0 && i % kNeighbours != 0) return;  // one field: nobody reads around it
   uint64_t ranks = 0;
   int count = 0;
   for (; count < kSiteFields && slots[count] >= 0; ++count) ranks |= s.needers[slots[count]];
@@ -343,8 +381,9 @@ template <typename T>
 cudaError_t ranks_build(const Fleet<T>& fleet) {
   const SolverView<T>& all = fleet.all();
   const unsigned table = ctas(all.table_size), slots = ctas(all.slot_capacity);
-  const unsigned homes = static_cast<unsigned>(all.home_capacity);
-  const unsigned around = ctas(all.home_capacity * kNeighbours);
+  const unsigned homes_of_all = ctas(all.home_capacity);
+  const auto homes = [](const SolverView<T>& s) { return static_cast<unsigned>(s.home_capacity); };
+  const auto around = [](const SolverView<T>& s) { return ctas(s.home_capacity * kNeighbours); };
   cudaError_t error = cudaSuccess;
   const auto meet = [&] {
     const cudaError_t met = fleet.meet();
@@ -356,7 +395,7 @@ cudaError_t ranks_build(const Fleet<T>& fleet) {
   fleet.of_all(clear);
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
     clear(s, stream);
-    insert_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    insert_kernel<T><<<homes(s), kThreads, 0, stream>>>(s);
   });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
@@ -376,18 +415,18 @@ cudaError_t ranks_build(const Fleet<T>& fleet) {
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
     hear_kernel<T><<<1, 1, 0, stream>>>(s, all, true);
-    take_kernel<T><<<ctas(homes), kThreads, 0, stream>>>(s, all, true);
+    take_kernel<T><<<homes_of_all, kThreads, 0, stream>>>(s, all, true);
   });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    send_kernel<T><<<homes, kThreads, 0, stream>>>(s, all);
+    send_kernel<T><<<homes(s), kThreads, 0, stream>>>(s, all);
     copy_kernel<T><<<table, kThreads, 0, stream>>>(s, all);
-    neighbours_kernel<T><<<around, kThreads, 0, stream>>>(s);
-    need_kernel<T><<<around, kThreads, 0, stream>>>(s, all);
+    neighbours_kernel<T><<<around(s), kThreads, 0, stream>>>(s);
+    need_kernel<T><<<around(s), kThreads, 0, stream>>>(s, all);
   });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    offer_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    offer_kernel<T><<<homes(s), kThreads, 0, stream>>>(s);
   });
   fleet.of_all([&](const SolverView<T>& s, cudaStream_t stream) {
     hold_kernel<T><<<ctas(s.slot_capacity * kNeighbours), kThreads, 0, stream>>>(s);
@@ -395,10 +434,10 @@ cudaError_t ranks_build(const Fleet<T>& fleet) {
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
     list_kernel<T><<<slots, kThreads, 0, stream>>>(s, all);
-    stripe_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    stripe_kernel<T><<<homes(s), kThreads, 0, stream>>>(s);
   });
   for (int pass = kPlacePass; pass <= kOwnPass; ++pass) {
-    if (!has_pass(all, pass)) continue;
+    if (!has_pass(fleet.views[0], pass)) continue;
     fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
       carry_kernel<T, false><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
     });
@@ -408,7 +447,7 @@ cudaError_t ranks_build(const Fleet<T>& fleet) {
     });
   }
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    bound_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+    bound_kernel<T><<<homes(s), kThreads, 0, stream>>>(s);
     finish_kernel<T><<<1, 1, 0, stream>>>(s);
   });
   fleet.of_all([&](const SolverView<T>& s, cudaStream_t stream) {
@@ -425,14 +464,14 @@ cudaError_t ranks_step(const Fleet<T>& fleet, int law_set) {
     const cudaError_t met = fleet.meet();
     if (error == cudaSuccess) error = met;
   };
-  if (fleet.all().own != nullptr) {
+  if (fleet.views[0].own != nullptr) {
     fleet.each(
         [](const SolverView<T>& s, cudaStream_t stream) { solver_free_to_nodes(s, stream); });
     meet();
     fleet.each([](const SolverView<T>& s, cudaStream_t stream) { solver_free_nodes(s, stream); });
     meet();
   }
-  for (int part = 0; part < points_parts(fleet.all()); ++part) {
+  for (int part = 0; part < points_parts(fleet.views[0]); ++part) {
     fleet.each(
         [&](const SolverView<T>& s, cudaStream_t stream) { solver_points(s, part, stream); });
     meet();
@@ -442,8 +481,9 @@ cudaError_t ranks_step(const Fleet<T>& fleet, int law_set) {
   fleet.each(
       [&](const SolverView<T>& s, cudaStream_t stream) { solver_from_nodes(s, law_set, stream); });
   meet();
-  fleet.each([](const SolverView<T>& s, cudaStream_t stream) { solver_end(s, stream); });
-  fleet.of_all([](const SolverView<T>& s, cudaStream_t stream) { solver_end(s, stream); });
+  fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
+    solver_end(s, s.rank == fleet.beside_all(), stream);
+  });
   return error == cudaSuccess ? cudaGetLastError() : error;
 }
 

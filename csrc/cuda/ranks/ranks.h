@@ -25,6 +25,28 @@ struct Fleet {
   const cudaEvent_t* event;    // [count + 1] likewise
 
   const SolverView<T>& all() const { return views[count]; }
+  // The streams of all devices begin after that of the view of all, and end before it goes on.
+  cudaError_t fork() const {
+    cudaSetDevice(device[count]);
+    cudaError_t error = cudaEventRecord(event[count], stream[count]);
+    for (int r = 0; r < count && error == cudaSuccess; ++r) {
+      if (!first_there(r) || device[r] == device[count]) continue;
+      cudaSetDevice(device[r]);
+      error = cudaStreamWaitEvent(stream[r], event[count], 0);
+    }
+    return error;
+  }
+  cudaError_t join() const {
+    cudaError_t error = cudaSuccess;
+    for (int r = 0; r < count && error == cudaSuccess; ++r) {
+      if (!first_there(r) || device[r] == device[count]) continue;
+      cudaSetDevice(device[r]);
+      error = cudaEventRecord(event[r], stream[r]);
+      cudaSetDevice(device[count]);
+      if (error == cudaSuccess) error = cudaStreamWaitEvent(stream[count], event[r], 0);
+    }
+    return error;
+  }
   // All of them go on when all have come here.
   cudaError_t meet() const {
     if (std::all_of(device, device + count, [&](int d) { return d == device[count]; }))
@@ -58,6 +80,11 @@ struct Fleet {
   void of_all(const F& f) const {
     cudaSetDevice(device[count]);
     f(views[count], stream[count]);
+  }
+
+  // The first rank on the device of the view of all.
+  int beside_all() const {
+    return static_cast<int>(std::find(device, device + count, device[count]) - device);
   }
 
  private:

@@ -9,8 +9,7 @@ namespace gsf::cuda {
 namespace {
 
 constexpr int kThreads = kSolverThreads;
-constexpr int kRanks = 64;      // ranks inside a cell that the stripe order knows
-constexpr int kPlaceBits = 26;  // of the place of a point on its rank, which stands above them
+constexpr int kRanks = 64;  // ranks inside a cell that the stripe order knows
 
 // Entry of a key, inserted when absent; -1 when the table is full. kFar: from several devices.
 template <bool kFar = false, typename T>
@@ -94,6 +93,7 @@ __global__ void __launch_bounds__(kThreads) homes_kernel(const __grid_constant__
   const int64_t e = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (e >= s.table_size || s.table_count[e] == 0) return;
   const uint64_t key = s.key[e];
+  if (s.table_count[e] > kMostOfHome) s.clock->reason = kFull;
   const int64_t h = static_cast<int64_t>(add(&s.clock->wanted_homes, 1));
   const int64_t start = static_cast<int64_t>(add(&s.clock->cursor, s.table_count[e]));
   if (h < s.home_capacity) {
@@ -239,8 +239,9 @@ template <typename T>
 __device__ const SolverView<T>& holder(const SolverView<T>& s, int32_t word, int64_t& place) {
   place = word;
   if (s.peers == nullptr) return s;
-  place &= (int64_t(1) << kPlaceBits) - 1;
-  return s.peers[uint32_t(word) >> kPlaceBits];
+  const int bits = place_bits(s.ranks);
+  place = uint32_t(word) & ((uint32_t(1) << bits) - 1);
+  return s.peers[uint32_t(word) >> bits];
 }
 
 // Order inside a home: by rank in the cell, then by cell, so that neighbouring lanes add to
@@ -377,6 +378,9 @@ __global__ void finish_kernel(const __grid_constant__ SolverView<T> s) {
   c.builds += 1;
   c.rebuild = 0;
   c.travel = 0.0;
+  if (s.peers == nullptr || c.homes > 0) return;
+  for (int64_t i = 0; i < kMailWords + s.collider_count * kImpulseSums; ++i)
+    s.mail[i] = 0;  // nobody else tells for a rank without points
 }
 
 inline unsigned ctas(int64_t n) { return static_cast<unsigned>((n + kThreads - 1) / kThreads); }

@@ -22,14 +22,16 @@ template <typename T>
 __global__ void __launch_bounds__(kSolverThreads)
     free_grid_kernel(const __grid_constant__ SolverView<T> s) {
   const SolverClock& clock = *s.clock;
-  const int64_t i = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
-  if (!may_step(clock) || i >= clock.slots * kBlockNodes) return;
-  const int64_t node = held_slot(s, i / kBlockNodes) * kBlockNodes + i % kBlockNodes;
-  const NodeSums<T> sums = read_sums(s, node);
-  clear_sums(s, node, 0);
-  Vec3<T> v;
-  node_velocity(s, sums, T(0), v);
-  store_velocity(s.free_velocity, node, v);
+  if (!may_step(clock)) return;
+  for (int64_t i = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
+       i < clock.slots * kBlockNodes; i += int64_t(gridDim.x) * kSolverThreads) {
+    const int64_t node = held_slot(s, i / kBlockNodes) * kBlockNodes + i % kBlockNodes;
+    const NodeSums<T> sums = read_sums(s, node);
+    clear_sums(s, node, 0);
+    Vec3<T> v;
+    node_velocity(s, sums, T(0), v);
+    store_velocity(s.free_velocity, node, v);
+  }
 }
 
 }  // namespace
@@ -42,9 +44,8 @@ void solver_free_to_nodes(const SolverView<T>& s, cudaStream_t stream) {
 }
 template <typename T>
 void solver_free_nodes(const SolverView<T>& s, cudaStream_t stream) {
-  const unsigned nodes =
-      static_cast<unsigned>((s.slot_capacity * kBlockNodes + kSolverThreads - 1) / kSolverThreads);
-  free_grid_kernel<T><<<nodes, kSolverThreads, 0, stream>>>(s);
+  const unsigned ctas = slot_ctas(s, kSolverThreads / kBlockNodes);
+  free_grid_kernel<T><<<ctas, kSolverThreads, 0, stream>>>(s);
 }
 
 template <typename T>

@@ -58,9 +58,31 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   SolverClock clock = *s.clock;
   clock.travel += float_of_bits(clock.moved);
   clock.moved = 0;
-  end_step(clock, double(s.dx), s.count);
+  end_step(clock, double(s.dx), s.total);
   choose_unit(clock);
   *s.clock = clock;
+}
+
+// What it does instead on one of several ranks: tells what the step was like.
+template <typename T>
+__device__ __noinline__ void tell(const SolverView<T>& s) {
+  const int lane = threadIdx.x & 31;
+  SolverClock& c = *s.clock;
+  for (int64_t i = lane; i < s.collider_count * kImpulseSums; i += 32)
+    s.mail[kMailWords + i] = s.impulse_units[i];
+  if (lane != 0) return;
+  s.mail[kMailSpeed] = static_cast<int64_t>(c.speed);
+  s.mail[kMailWave] = static_cast<int64_t>(c.wave);
+  s.mail[kMailGradient] = static_cast<int64_t>(c.gradient);
+  s.mail[kMailBound] = static_cast<int64_t>(c.bound);
+  s.mail[kMailPlastic] = c.plastic;
+  s.mail[kMailGuarded] = c.guarded;
+  s.mail[kMailInverted] = c.inverted;
+  s.mail[kMailInvalid] = c.invalid;
+  s.mail[kMailTouched] = c.touched;
+  s.mail[kMailLost] = c.lost;
+  s.mail[kMailLeaving] = c.leaving;
+  c.plastic = c.guarded = c.inverted = c.invalid = 0;
 }
 
 // Brings velocities of the nodes of a window near.
@@ -151,7 +173,11 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws, kKeeps))
   unsigned bits[4];
   if (!end.leave(values, bits)) return;
   hand_over(s, bits, home, true);
-  if (last_to_arrive(&s.clock->arrived, arrivals) && s.peers == nullptr) end_of_step(s);
+  if (!last_to_arrive(&s.clock->arrived, arrivals)) return;
+  if (s.peers == nullptr)
+    end_of_step(s);
+  else
+    tell(s);
 }
 
 template <typename T, int kLaws, bool kKeeps>

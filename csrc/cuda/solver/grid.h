@@ -49,7 +49,7 @@ template <typename T>
 __device__ double sum_unit(const SolverView<T>& s, int i) {
   if (i == 6) return s.clock->mass_unit;
   const double heaviest = s.clock->mass_unit * double(int64_t(1) << (s.clock->unit_bits - 1));
-  const double impulse = heaviest * double(s.count) * (8e6 / double(int64_t(1) << 62));
+  const double impulse = heaviest * double(s.total) * (8e6 / double(int64_t(1) << 62));
   return i < 3 ? impulse : impulse * double(s.dx) * 4096.0;
 }
 
@@ -405,13 +405,24 @@ __global__ void __launch_bounds__(kSolverThreads, kGridCtas)
     held.clear();
     __syncthreads();
   }
-  const int64_t slot =
-      int64_t(blockIdx.x) * (kSolverThreads / kBlockNodes) + threadIdx.x / kBlockNodes;
   // p2g has read the bounds of this step; g2p raises those of the next one from nothing.
   const int64_t home = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
   if (home < clock.homes) s.home_bound[home] = T(0);
-  if (slot < clock.slots) update_slot<T, kPoints>(s, held, held_slot(s, slot));
+  constexpr int kSlotsPerCta = kSolverThreads / kBlockNodes;
+  for (int64_t i = int64_t(blockIdx.x) * kSlotsPerCta + threadIdx.x / kBlockNodes; i < clock.slots;
+       i += int64_t(gridDim.x) * kSlotsPerCta)
+    update_slot<T, kPoints>(s, held, held_slot(s, i));
   if (s.collider_count > 0) held.hand_over(s);
+}
+
+// CTAs for `per` of the slots that are held each: for all there is room for; of several ranks for
+// about as many as one holds, and each goes on while there are more. CTAs without work take time.
+template <typename T>
+unsigned slot_ctas(const SolverView<T>& s, int per) {
+  const int64_t all = (s.slot_capacity + per - 1) / per;
+  if (s.peers == nullptr) return static_cast<unsigned>(all);
+  const int64_t homes = (s.home_capacity + kSolverThreads - 1) / kSolverThreads;
+  return static_cast<unsigned>(max(homes, all / s.ranks + all / 16 + 1));
 }
 
 // kPoints: of scenes whose points are pushed.
@@ -422,9 +433,7 @@ void launch_nodes(const SolverView<T>& s, cudaStream_t stream) {
     contact_kernel<T, kPoints>  // a shared site has two slots at least
         <<<min(static_cast<unsigned>((s.slot_capacity + 1) / 2), kSharedCtas), kBlockNodes, 0,
            stream>>>(s);
-  grid_kernel<T, kPoints>
-      <<<static_cast<unsigned>((s.slot_capacity + kSlotsPerCta - 1) / kSlotsPerCta), kSolverThreads,
-         0, stream>>>(s);
+  grid_kernel<T, kPoints><<<slot_ctas(s, kSlotsPerCta), kSolverThreads, 0, stream>>>(s);
 }
 
 }  // namespace

@@ -22,7 +22,7 @@ cudaError_t solver_prime(const SolverView<T>& s, int law_set, cudaStream_t strea
 // Parts of these, between which several ranks wait for each other (cuda/ranks/ranks.h). Before the
 // first step: its speeds, then its stress, and the clock of each. In a step: points to nodes,
 // without and with what acts on them; nodes, and nodes to points. One rank's step ends with that;
-// what several told makes its end.
+// what several told makes its end, that of the view of all too if it is to.
 template <typename T>
 void solver_prime_points(const SolverView<T>& s, int law_set, bool measure, cudaStream_t stream);
 template <typename T>
@@ -36,7 +36,7 @@ void solver_to_nodes(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
 void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream);
 template <typename T>
-void solver_end(const SolverView<T>& s, cudaStream_t stream);
+void solver_end(const SolverView<T>& s, bool with_all, cudaStream_t stream);
 
 // Parts by what a scene has.
 // Points that keep a share of their own motion: g2p (solver_free_to_nodes came before).

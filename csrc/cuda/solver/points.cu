@@ -155,7 +155,7 @@ __device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, Gi
 template <typename T>
 __device__ double radius_of(const SolverView<T>& s, int64_t p) {
   const int32_t id = s.id[p];
-  return id >= 0 && id < s.count ? double(s.radius[id]) : 0.0;
+  return id >= 0 && id < s.total ? double(s.radius[id]) : 0.0;
 }
 
 // Friction beyond this holds all the same; the unit of the sums is for less.

@@ -17,7 +17,7 @@ template <typename T, int kLaws>
 __global__ void __launch_bounds__(kThreads)
     prime_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   const SolverClock& clock = *s.clock;
-  if (int64_t(blockIdx.x) >= clock.homes) return;
+  if (clock.grow != 0 || int64_t(blockIdx.x) >= clock.homes) return;
   __shared__ CtaEnd<4> end;
   end.clear();
   __syncthreads();
@@ -38,9 +38,11 @@ __global__ void __launch_bounds__(kThreads)
   if (s.peers == nullptr) start(s, measure);
 }
 
-// Of several ranks: the maxima and sums of all are this one's, and the step ends. One warp.
+// Of several ranks: the maxima and sums of all are this one's, and the step ends. One warp; a
+// second CTA does the same for the view of all.
 template <typename T>
-__global__ void end_kernel(const __grid_constant__ SolverView<T> s) {
+__global__ void end_kernel(const __grid_constant__ SolverView<T> own) {
+  const SolverView<T>& s = blockIdx.x == 0 ? own : own.peers[own.ranks];
   SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
   __shared__ int64_t all[kMailWords];
@@ -88,33 +90,12 @@ __global__ void tell_start_kernel(const __grid_constant__ SolverView<T> s) {
 template <typename T>
 __global__ void start_kernel(const __grid_constant__ SolverView<T> s, bool measure) {
   SolverClock& c = *s.clock;
+  if (c.grow != 0) return;  // a rank had no room for its points
   uint64_t* largest[] = {&c.speed, &c.wave, &c.gradient, &c.bound};
   for (int i = kMailSpeed; i <= kMailBound; ++i)
     for (int q = 0; q < s.ranks; ++q)
       *largest[i] = max(*largest[i], static_cast<uint64_t>(s.peers[q].mail[i]));
   start(s, measure);
-}
-
-// A rank tells what its step was like.
-template <typename T>
-__global__ void tell_kernel(const __grid_constant__ SolverView<T> s) {
-  SolverClock& c = *s.clock;
-  if (!may_step(c)) return;
-  for (int64_t i = threadIdx.x; i < s.collider_count * kImpulseSums; i += 32)
-    s.mail[kMailWords + i] = s.impulse_units[i];
-  if (threadIdx.x != 0) return;
-  s.mail[kMailSpeed] = static_cast<int64_t>(c.speed);
-  s.mail[kMailWave] = static_cast<int64_t>(c.wave);
-  s.mail[kMailGradient] = static_cast<int64_t>(c.gradient);
-  s.mail[kMailBound] = static_cast<int64_t>(c.bound);
-  s.mail[kMailPlastic] = c.plastic;
-  s.mail[kMailGuarded] = c.guarded;
-  s.mail[kMailInverted] = c.inverted;
-  s.mail[kMailInvalid] = c.invalid;
-  s.mail[kMailTouched] = c.touched;
-  s.mail[kMailLost] = c.lost;
-  s.mail[kMailLeaving] = c.leaving;
-  c.plastic = c.guarded = c.inverted = c.invalid = 0;
 }
 
 }  // namespace
@@ -172,12 +153,11 @@ void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream)
     launch_g2p<T, kMoreLaws, false>(s, stream);
   else
     launch_g2p<T, kAnyLaw, false>(s, stream);
-  if (s.peers != nullptr) tell_kernel<T><<<1, 32, 0, stream>>>(s);
 }
 
 template <typename T>
-void solver_end(const SolverView<T>& s, cudaStream_t stream) {
-  end_kernel<T><<<1, 32, 0, stream>>>(s);
+void solver_end(const SolverView<T>& s, bool with_all, cudaStream_t stream) {
+  end_kernel<T><<<with_all ? 2 : 1, 32, 0, stream>>>(s);
 }
 
 template <typename T>
@@ -198,7 +178,7 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   template cudaError_t solver_prime<T>(const SolverView<T>&, int, cudaStream_t);       \
   template void solver_to_nodes<T>(const SolverView<T>&, cudaStream_t);                \
   template void solver_from_nodes<T>(const SolverView<T>&, int, cudaStream_t);         \
-  template void solver_end<T>(const SolverView<T>&, cudaStream_t);                     \
+  template void solver_end<T>(const SolverView<T>&, bool, cudaStream_t);               \
   template cudaError_t solver_step<T>(const SolverView<T>&, int, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

@@ -1,12 +1,14 @@
 """Small shots beside each other on one GPU, against the same shots one after the other.
 
     python scripts/bench/sweep/packing.py [--device cuda] [--shots 8] [--pack 8] [--json FILE]
+    python scripts/bench/sweep/packing.py --shots 64 --gpus 1 2 [--json FILE]     # on so many GPUs
     python scripts/bench/sweep/packing.py --page FILE.json     # enters the table into the docs
 
 A melon is filled and textured once; then the shots, which differ in their seed, go through
 gsfluent.sweep twice, one at a time and --pack at a time. Time counts from the first to the last
 shot, start of processes included. Films and figures of both are compared. Two minutes on a GPU
-with sixteen cores; on a CPU --pack is the number of processes. Enters docs/measured/sweeps.md.
+with sixteen cores; on a CPU --pack is the number of processes. With --gpus: --pack at a time on
+each of so many GPUs, against the first number of them. Enters docs/measured/sweeps.md.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import yaml
 import gsfluent as gf
 from gsfluent.cli.common import choose_device
 from gsfluent.figure.markdown import enter
-from gsfluent.hardware import processor
+from gsfluent.hardware import graphics_cards, processor
 from gsfluent.io import save_splats
 from gsfluent.progress import LineReporter
 from gsfluent.sweep import read_sweep, run_sweep
@@ -76,21 +78,69 @@ def figures(out: Path) -> dict[int, Any]:
     }
 
 
+def prepare(options: argparse.Namespace, device: torch.device) -> Path:
+    """A first shot, whose solids the others share."""
+    first: Path = options.out / "warm"
+    timed(sweep_file(options.out, [WARM], options.seconds, 1, device.type), first, device, 1)
+    return first
+
+
+def swept(
+    options: argparse.Namespace, device: torch.device, first: Path, name: str, pack: int, jobs: int
+) -> tuple[float, dict[int, Any]]:
+    """Seconds that all shots take, so many at a time, and their figures."""
+    out = options.out / name
+    shutil.rmtree(out, ignore_errors=True)
+    for part in ("stages", "solids"):
+        shutil.copytree(first / part, out / part)
+    seeds = list(range(options.shots))
+    file = sweep_file(options.out, seeds, options.seconds, pack, device.type)
+    return timed(file, out, device, jobs), figures(out)
+
+
+def spread(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """The same shots on each number of GPUs."""
+    device, cards = choose_device("cuda"), graphics_cards()
+    first, rows = prepare(options, device), []
+    wanted: dict[int, Any] = {}
+    for count in options.gpus:
+        os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(cards[:count])  # for the processes
+        jobs = options.pack * count
+        wall, found = swept(options, device, first, f"gpus_{count}", options.pack, jobs)
+        wanted = wanted or found
+        rows.append({
+            "device": torch.cuda.get_device_name(device), "cores": os.cpu_count(), "gpus": count,
+            "shots": options.shots, "pack": options.pack, "wall": wall,
+            "same_figures": found == wanted,
+        })  # fmt: skip
+    return rows
+
+
+def spread_table(rows: list[dict[str, Any]]) -> str:
+    """The table of several GPUs."""
+    one = rows[0]
+    lines = [
+        f"{one['shots']} drops of a melon on {one['device']} with {one['cores']} cores, "
+        f"{one['pack']} at a time on each GPU:",
+        "",
+        "| GPUs | wall [s] | a shot [s] | times the first | figures of the first |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {r['gpus']} | {r['wall']:.1f} | {r['wall'] / r['shots']:.2f} | "
+        f"{one['wall'] / r['wall']:.2f} | {'yes' if r['same_figures'] else 'no'} |"
+        for r in rows
+    ]
+    return "\n".join(lines)
+
+
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Both sweeps."""
     device = choose_device(options.device)
-    seeds = list(range(options.shots))
     walls, found = {}, {}
-    first = options.out / "warm"
-    timed(sweep_file(options.out, [WARM], options.seconds, 1, device.type), first, device, 1)
+    first = prepare(options, device)
     for pack in (options.pack, 1):
-        out = options.out / f"pack_{pack}"
-        shutil.rmtree(out, ignore_errors=True)
-        for name in ("stages", "solids"):
-            shutil.copytree(first / name, out / name)
-        file = sweep_file(options.out, seeds, options.seconds, pack, device.type)
-        walls[pack] = timed(file, out, device, pack)
-        found[pack] = figures(out)
+        walls[pack], found[pack] = swept(options, device, first, f"pack_{pack}", pack, pack)
     alone = SweepFolder(options.out / "pack_1")
     peaks = [
         row["value"]["figures"]["peak_device_memory_bytes"]
@@ -124,6 +174,11 @@ def markdown(row: dict[str, Any]) -> str:
     ])  # fmt: skip
 
 
+def table(row: Any) -> str:
+    """The table of what was measured."""
+    return spread_table(row) if isinstance(row, list) else markdown(row)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -134,17 +189,24 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.6, help="of film")
     parser.add_argument("-o", "--out", type=Path, default=Path("packing"))
     parser.add_argument("--json", type=Path, help="where the figures go")
+    parser.add_argument("--gpus", type=int, nargs="*", help="numbers of GPUs to spread shots over")
     parser.add_argument("--page", type=Path, metavar="FILE.json", help="only enter these")
     options = parser.parse_args()
     if options.page is not None:
         row = json.loads(options.page.read_text())
-        PAGE.write_text(enter(PAGE.read_text(), "packing", markdown(row)))
+        part = "spread" if isinstance(row, list) else "packing"
+        heading = "## On several GPUs" if part == "spread" else "## Packed"
+        PAGE.write_text(enter(PAGE.read_text(), part, table(row), heading))
         return
-    row = measure(options)
+    if options.gpus:
+        there = len(graphics_cards())
+        if not 1 <= min(options.gpus) <= max(options.gpus) <= there:
+            parser.error(f"--gpus: this machine has {there}, got {options.gpus}")
+    row = spread(options) if options.gpus else measure(options)
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(row, indent=1) + "\n")
-    print(markdown(row))
+    print(table(row))
 
 
 if __name__ == "__main__":
