@@ -16,7 +16,7 @@ from gsfluent._check import check_tensor
 from gsfluent.materials.phase_field import MODELS
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops.plasticity import LAWS, SLOW_UNLOADING, return_mapping, weakened
-from gsfluent.ops.reference.phase_field import DRIVE_MAX
+from gsfluent.ops.reference.phase_field import DRIVE_MAX, EMPTY
 from gsfluent.ops.solver_buffers import INDEX
 from gsfluent.ops.solver_ranks import Parts
 from gsfluent.ops.viscous import viscous_step
@@ -140,9 +140,10 @@ class SolverState:
         return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
 
     def _damage_scale(self, law: Tensor, rows: Tensor) -> Tensor:
-        """Units of the sums of the damage field and whether its model is AT2, float64 [5].
+        """Units of the sums of the damage field, by the largest volume, history and stiffness.
 
-        For the largest volume, history and stiffness of a point: ``csrc/core/solver/damage.h``.
+        Returns:
+            Four units, 1 of AT2, volume of an empty node (``csrc/core/solver/damage.h``), float64.
         """
         own = rows[law == LAWS["phase_field"]].double()
         most = float(own[:, 11].max())
@@ -153,7 +154,7 @@ class SolverState:
             for bound in (most, most * DRIVE_MAX, stiff, most)
         ]
         at2 = float(int(own[0, 5]) >= MODELS["at2"])
-        return own.new_tensor([*units, at2])
+        return own.new_tensor([*units, at2, EMPTY * most])
 
     def _load(
         self, position: Tensor, values: dict[str, Tensor], row: Tensor, body: Tensor | None

@@ -10,6 +10,9 @@ namespace gsf {
 
 inline constexpr double kOmega = 1.5;
 inline constexpr int kSweeps = 4;
+// Volume below which a node is empty, over that of the largest point: what it holds beyond that is
+// rounding, and whether an edge leads there must not hang on it.
+inline constexpr double kEmptyNode = 1.0 / double(1 << 24);
 
 // Sums of a node: damage, history and stiffness times volume, and volume; volumes in units of dx^2
 // / 4, as rows have them.
@@ -20,6 +23,8 @@ inline constexpr int kDamageSum = 0, kDriveSum = 1, kStiffSum = 2, kVolumeSum = 
 enum DamagePlane : int { kHotPlane, kActivePlane, kHotList, kActiveList, kFaces };
 inline constexpr int kDamagePlanes = kFaces + 6;
 enum DamageCount : int { kHotCount, kActiveCount, kHomeCount };
+// Of SolverView::damage_scale, after the units of the sums.
+inline constexpr int kScaleAt2 = kDamageSums, kScaleEmpty = kDamageSums + 1;
 enum DamageFace : int32_t { kNoBlock = -1, kUndamaged = -2 };
 
 // What a point gives before its weights; `row` is its row of SolverView::rows.
@@ -41,11 +46,12 @@ struct DamageNode {
 // Weight of the edge between two nodes with matter.
 GSF_HOST_DEVICE double edge_weight(double stiff, double beyond) { return 0.5 * (stiff + beyond); }
 // weight(f): of the edge towards neighbour f of x+, x-, y+, y-, z+, z-; the own stiffness where
-// nothing is damaged beyond, and 0 towards an empty node.
+// nothing is damaged beyond, and 0 towards an empty node. `empty` is the largest volume of those.
 template <typename Weight>
-GSF_HOST_DEVICE DamageNode damage_node(const double* sums, bool at2, const Weight& weight) {
+GSF_HOST_DEVICE DamageNode damage_node(const double* sums, bool at2, double empty,
+                                       const Weight& weight) {
   const double volume = sums[kVolumeSum], drive = sums[kDriveSum];
-  if (!(volume > 0.0)) return {0.0, 0.0, 0.0, 0.0};
+  if (!(volume > empty)) return {0.0, 0.0, 0.0, 0.0};
   double whole = at2 ? drive + 2.0 * volume : drive;
   for (int f = 0; f < 6; ++f) whole += weight(f);
   return {sums[kDamageSum] / volume, sums[kStiffSum], at2 ? drive : drive - volume,

@@ -248,7 +248,7 @@ struct SolverView {
   int32_t* damage_slots;   // [kDamagePlanes, S]
   int32_t* damage_homes;   // [H] homes that meet slots that take part
   int32_t* damage_counts;  // [3] slots of points to solve for, slots that take part, such homes
-  double* damage_scale;    // [5] units of the sums, and 1 of AT2
+  double* damage_scale;    // [6] units of the sums, 1 of AT2, volume of an empty node
 
   // Whether this rank answers for a slot: counts its contacts, books its impulses. The first does
   // that needs its velocities.

@@ -12,9 +12,12 @@ template <typename T>
 class DamagePass {
  public:
   explicit DamagePass(const SolverView<T>& s) : s_(s) {
-    at2_ = false;
-    for (int64_t row = 0; row < s.row_count; ++row)
-      if (s.law[row] == kPhaseField) at2_ = is_at2(load_material(s.rows + row * kRowColumns));
+    for (int64_t row = 0; row < s.row_count; ++row) {
+      if (s.law[row] != kPhaseField) continue;
+      const T* r = s.rows + row * kRowColumns;
+      at2_ = is_at2(load_material(r));
+      empty_ = std::max(empty_, kEmptyNode * double(r[kStressColumn]));
+    }
     active_ = active_alpha<T>(at2_);
   }
 
@@ -180,14 +183,14 @@ class DamagePass {
           const Sums& node = nodes_[n];
           Edge& e = edge_[n];
           const double sums[kDamageSums] = {node[0], node[1], node[2], node[3]};
-          const DamageNode now = damage_node(sums, at2_, [&](int f) {
+          const DamageNode now = damage_node(sums, at2_, empty_, [&](int f) {
             bool inside;
             const int there = face_node(local, f, inside);
             const int32_t slot = inside ? slots_[b] : face[f];
             if (slot < 0) return 0.0;
             if (number_[slot] < 0) return node[kStiffSum];
             const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
-            if (!(nodes_[m][kVolumeSum] > 0.0)) return 0.0;
+            if (!(nodes_[m][kVolumeSum] > empty_)) return 0.0;
             e.near[f] = static_cast<int32_t>(m);
             return e.weight[f] = edge_weight(node[kStiffSum], nodes_[m][kStiffSum]);
           });
@@ -246,7 +249,8 @@ class DamagePass {
   };
 
   const SolverView<T>& s_;
-  bool at2_;
+  bool at2_ = false;
+  double empty_ = 0.0;
   T active_;  // alpha from which a point takes part
   std::vector<uint64_t> keys_;
   std::vector<int32_t> colors_[kColors], homes_[kColors];  // homes by colour; those that take part

@@ -34,7 +34,7 @@ __global__ void __launch_bounds__(kSolverThreads)
   const HomeList<T>& homes = s.next_homes();
   const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
   const int32_t* neighbour = s.neighbour + int64_t(blockIdx.x) * kNeighbours;
-  const T active = active_alpha<T>(s.damage_scale[kDamageSums] != 0.0);
+  const T active = active_alpha<T>(s.damage_scale[kScaleAt2] != 0.0);
   for (int64_t r = threadIdx.x; r < count; r += kSolverThreads) {
     const int64_t p = first + r;
     if (p < 0 || p >= s.count || !takes_part(s.alpha[p], s.peak[p], active)) continue;
@@ -149,7 +149,8 @@ struct Solve {
 
   // The equation of every node.
   __device__ void prepare() const {
-    const bool at2 = s.damage_scale[kDamageSums] != 0.0;
+    const bool at2 = s.damage_scale[kScaleAt2] != 0.0;
+    const double empty = s.damage_scale[kScaleEmpty];
     double unit[kDamageSums];
     for (int c = 0; c < kDamageSums; ++c) unit[c] = s.damage_scale[c];
     const int64_t work = int64_t(s.damage_counts[kActiveCount]) * kBlockNodes;
@@ -159,13 +160,13 @@ struct Solve {
       const int64_t* units = s.damage_sums + kDamageSums * (int64_t(slot) * kBlockNodes + local);
       double sums[kDamageSums];
       for (int c = 0; c < kDamageSums; ++c) sums[c] = double(units[c]) * unit[c];
-      nodes(slot)[local] = damage_node(sums, at2, [&](int f) {
+      nodes(slot)[local] = damage_node(sums, at2, empty, [&](int f) {
         bool inside;
         const int there = face_node(local, f, inside);
         const int32_t other = beyond(slot, f, inside);
         if (other < 0) return other == kUndamaged ? sums[kStiffSum] : 0.0;
         const int64_t* far = s.damage_sums + kDamageSums * (int64_t(other) * kBlockNodes + there);
-        if (far[kVolumeSum] <= 0) return 0.0;
+        if (!(double(far[kVolumeSum]) * unit[kVolumeSum] > empty)) return 0.0;
         return edge_weight(sums[kStiffSum], double(far[kStiffSum]) * unit[kStiffSum]);
       });
     }

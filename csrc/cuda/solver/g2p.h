@@ -11,7 +11,7 @@ constexpr int kG2PThreads = 128;  // as kP2GThreads
 // CTAs of a multiprocessor: more for the laws that need fewer registers.
 constexpr int g2p_ctas(int laws, bool keeps) {
   if (keeps) return 4;
-  if (with_springs(laws) || laws == kDamageField) return 5;
+  if (with_springs(laws)) return 5;
   return laws == kElasticOnly ? 7 : 6;
 }
 
