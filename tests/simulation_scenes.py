@@ -9,6 +9,10 @@ from gsfluent import materials
 from gsfluent.data import Frame
 from gsfluent.scene.scene import Scene
 
+CLAY = materials.Material(
+    "clay", law="phase_field", young_modulus=2e5, poisson_ratio=0.25, density=1200.0,
+    toughness=40.0, tensile_strength=9e3, prefer="strength",
+)  # fmt: skip
 SOFT = materials.elastic.override(young_modulus=2e4)
 
 
@@ -33,4 +37,12 @@ def resting(second: bool) -> Scene:
     scene.add(ellipsoid((0.05, 0.05, 0.04)), SOFT, frame=at(0, 0, 0.04))
     if second:
         scene.pour((0.01, 0, 0.3), 1.0, 0.03, duration=0.06, material=SOFT, at=1.6)
+    return scene
+
+
+def dropped(material: materials.Material, height: float) -> Scene:
+    """A ball of 0.2 m that falls from this height."""
+    scene = Scene()
+    scene.add(ellipsoid((0.1, 0.1, 0.1)), material)
+    scene.drop(height)
     return scene

@@ -7,7 +7,7 @@
 
 #include "core/collider/collider.h"
 #include "core/material/viscous.h"
-#include "core/solver/state.h"
+#include "core/solver/damage.h"
 #include "torch_api.h"
 
 namespace gsf {
@@ -72,6 +72,12 @@ enum SolverBuffer : int {
   kNeeders,
   kMail,
   kPeers,
+  kDamageSumUnits,
+  kDamageNodes,
+  kDamageSlots,
+  kDamageHomes,
+  kDamageCounts,
+  kDamageScale,
   kSolverBuffers
 };
 
@@ -189,6 +195,12 @@ struct SolverOps {
         {"needers", c, 1, i64, true},
         {"mail", kMailWords + s.collider_count * kImpulseSums, 1, i64, true},
         {"peers", ints[kRanks] + 1, kViewBytes, ScalarType::Byte, true},
+        {"damage_sums", c * kBlockNodes, kDamageSums, i64, true},
+        {"damage_nodes", c * kBlockNodes, kDamageSums, ScalarType::Double, true},
+        {"damage_slots", kDamagePlanes, c, i32, true},
+        {"damage_homes", h, 1, i32, true},
+        {"damage_counts", 3, 1, i32, true},
+        {"damage_scale", kDamageSums + 2, 1, ScalarType::Double, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);
@@ -228,6 +240,9 @@ struct SolverOps {
     comes_with(kContactRadius, kSlotGiven);
     comes_with(kObject, kContactRadius);
     comes_with(kObject, kPress);
+    for (int i = kDamageSumUnits; i < kDamageScale; ++i)
+      STD_TORCH_CHECK(!device || ints[kLawSet] != kDamageField || b[i].numel() > 0,
+                      "solver: ", wanted[i].name, " is missing");
     const bool any_law = ints[kLawSet] != 0;
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),
                     "solver: these laws need alpha and peak");
@@ -295,6 +310,12 @@ struct SolverOps {
     s.needers = static_cast<uint64_t*>(any_at(kNeeders));
     s.mail = static_cast<int64_t*>(any_at(kMail));
     s.peers = static_cast<const SolverView<T>*>(any_at(kPeers));
+    s.damage_sums = static_cast<int64_t*>(any_at(kDamageSumUnits));
+    s.damage_nodes = static_cast<double*>(any_at(kDamageNodes));
+    s.damage_slots = int_at(kDamageSlots);
+    s.damage_homes = int_at(kDamageHomes);
+    s.damage_counts = int_at(kDamageCounts);
+    s.damage_scale = static_cast<double*>(any_at(kDamageScale));
     return s;
   }
 

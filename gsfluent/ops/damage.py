@@ -21,7 +21,7 @@ from gsfluent._check import check_tensor
 from gsfluent.materials.laws import LAWS
 from gsfluent.materials.phase_field import GRID_ENERGY, MODELS
 from gsfluent.ops.blocks import Blocks, check_blocks, check_dx
-from gsfluent.ops.reference.phase_field import BROKEN, DRIVE_MAX, drive_threshold
+from gsfluent.ops.reference.phase_field import BROKEN, DRIVE_MAX, EMPTY, drive_threshold
 
 SWEEPS = 4
 OMEGA = 1.5
@@ -242,14 +242,14 @@ def solve_drive(
     field = torch.zeros_like(active, dtype=torch.int64) if body is None else body.long()
     nodes = _nodes(position, active, field, dx, blocks)
     rows = nodes.rows
-    v = volume[rows]
     if takes_part is not None:
-        v = torch.where(takes_part[rows], v, 0.0)
+        volume = torch.where(takes_part, volume, 0.0)
+    v = volume[rows]
     stiff = 2.0 * (length[rows] / dx) ** 2
     given = torch.stack([v * damage[rows], v * drive[rows].clamp(max=DRIVE_MAX), v * stiff, v], 1)
     sums = _sums(nodes, given)
-    guess, driven, stiff, here = sums.unbind(dim=1)
-    there = here > 0
+    there = sums[:, 3] > EMPTY * volume.detach().max()
+    guess, driven, stiff, here = torch.where(there[:, None], sums, 0.0).unbind(dim=1)
     guess = torch.where(there, guess / torch.where(there, here, 1.0), 0.0).detach()
     edge = _edges(nodes, stiff, there)
     at1 = model == "at1"

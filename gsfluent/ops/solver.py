@@ -33,6 +33,7 @@ from gsfluent.ops.solver_state import (
     VISCOUS,
     VISCOUS_ANY,
     SolverState,
+    sum_bits,
 )
 from gsfluent.ops.viscous import check_viscous
 
@@ -245,11 +246,11 @@ class Solver(SolverState):
             self._law_set = MORE_LAWS
         if PHASE in laws:
             self._law_set = DAMAGE_FIELD
-            if self.device.type != "cpu" or not laws <= {ELASTIC, NACC, PHASE}:
+            if not laws <= {ELASTIC, NACC, PHASE}:
                 raise ValueError(
-                    f"{op}: law phase_field (9) works on the CPU beside laws 0 and 1 only, got "
-                    f"{sorted(laws)} on {self.device}; step it by p2g, grid_update, g2p, "
-                    "damage_solve and return_mapping"
+                    f"{op}: law phase_field (9) works beside laws 0 and 1 only, got "
+                    f"{sorted(laws)}; step it by p2g, grid_update, g2p, damage_solve and "
+                    "return_mapping"
                 )
             codes = {int(c) >> 2 for c in self._params[self._law == PHASE, 5].tolist()}
             if len(codes) > 1:
@@ -267,6 +268,8 @@ class Solver(SolverState):
         row, rows, row_law = self._rows(material, mass, volume)
         b = layout.empty_buffers(velocity, n)
         b.law, b.rows = row_law, rows
+        if self._law_set == DAMAGE_FIELD and self.device.type == "cuda":
+            b.damage_scale = self._damage_scale(row_law, rows)
         if colliders is not None and colliders.shape[0] > 0:
             check_colliders(op, pad_colliders(colliders), 0 if sdf is None else sdf.shape[0])
             b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
@@ -320,7 +323,7 @@ class Solver(SolverState):
         if parent is not None or cut is not None:
             b.parent, b.cut = self._per_field("parent", parent), self._per_field("cut", cut)
         heaviest = float(mass.max())
-        bits = min(52, 62 - max(0, math.ceil(math.log2(0.43 * n))))
+        bits = sum_bits(n)
         self._write(
             cfl=cfl, gradient_limit=gradient_limit, dt_scale=1.0, dt_fixed=dt or 0.0,
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),

@@ -12,6 +12,7 @@ BLOCK_NODES = 64
 NEIGHBOURS = 27
 SITE_FIELDS = 16
 CONTACT_MOMENTS = 3
+DAMAGE_PLANES = 10
 IMPULSE_SUMS = 7
 BLOCK_RANGE = 2**16
 MAX_FIELDS = 2**12 - 2
@@ -104,6 +105,12 @@ class Buffers:
     needers: Tensor
     mail: Tensor
     peers: Tensor
+    damage_sums: Tensor
+    damage_nodes: Tensor
+    damage_slots: Tensor
+    damage_homes: Tensor
+    damage_counts: Tensor
+    damage_scale: Tensor
 
     def listed(self) -> list[Tensor]:
         """Return the tensors in the order the operators take them."""
@@ -148,6 +155,11 @@ class Buffers:
                 self.push, self.slot_given = torch.zeros_like(self.sums), whole(slots)
             if self.object.numel():
                 self.press = torch.zeros_like(self.sums)
+            if self.damage_scale.numel():
+                self.damage_sums = torch.zeros_like(self.sums)
+                self.damage_nodes = torch.zeros_like(self.sums, dtype=torch.float64)
+                self.damage_slots, self.damage_homes = whole(DAMAGE_PLANES, slots), whole(homes)
+                self.damage_counts = whole(3)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
         if self.peers.numel():
@@ -227,15 +239,17 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
         values[name] = zeros(count, dtype=torch.int32)
     values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
     whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut",
-             "object", "slot_given", "home_rank", "home_place")  # fmt: skip
+             "object", "slot_given", "home_rank", "home_place", "damage_slots", "damage_homes",
+             "damage_counts")  # fmt: skip
     for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):
         values[name] = zeros(0, 4, dtype=torch.int32)
-    for name in ("push", "press", "holders", "needers", "mail"):
+    for name in ("push", "press", "holders", "needers", "mail", "damage_sums"):
         values[name] = zeros(0, dtype=torch.int64)
     values["peers"] = zeros(0, dtype=torch.uint8)
-    values["spring_rows"] = zeros(0, dtype=torch.float64)
+    for name in ("spring_rows", "damage_nodes", "damage_scale"):
+        values[name] = zeros(0, dtype=torch.float64)
     values["clock"] = zeros(CLOCK_WORDS, dtype=torch.int64)
     values["impulse_units"] = zeros(0, IMPULSE_SUMS, dtype=torch.int64)
     values["impulse"] = zeros(0, IMPULSE_SUMS, dtype=torch.float64)

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.materials.phase_field import MODELS
 from gsfluent.ops import solver_buffers as layout
-from gsfluent.ops.plasticity import SLOW_UNLOADING, return_mapping, weakened
+from gsfluent.ops.plasticity import LAWS, SLOW_UNLOADING, return_mapping, weakened
+from gsfluent.ops.reference.phase_field import DRIVE_MAX, EMPTY
 from gsfluent.ops.solver_buffers import INDEX
 from gsfluent.ops.solver_ranks import Parts
 from gsfluent.ops.viscous import viscous_step
@@ -22,10 +24,14 @@ from gsfluent.ops.viscous import viscous_step
 UNBROKEN = -1.0
 """Peak alpha of points whose law does not break."""
 MORE_LAWS, DAMAGE_FIELD, VISCOUS, VISCOUS_ANY = 3, 4, 5, 6
-"""Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``; damage fields
-have kernels on the CPU only."""
+"""Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``."""
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
+
+
+def sum_bits(count: int) -> int:
+    """Bits of a fixed-point unit below its largest addend: sums of ``count`` of them fit 2^62."""
+    return min(52, 62 - max(0, math.ceil(math.log2(0.43 * count))))
 
 
 class SolverState:
@@ -132,6 +138,23 @@ class SolverState:
         numbers = torch.cat([unique[:, 1:2], pace[:, None], derived], dim=1)
         rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
+
+    def _damage_scale(self, law: Tensor, rows: Tensor) -> Tensor:
+        """Units of the sums of the damage field, by the largest volume, history and stiffness.
+
+        Returns:
+            Four units, 1 of AT2, volume of an empty node (``csrc/core/solver/damage.h``), float64.
+        """
+        own = rows[law == LAWS["phase_field"]].double()
+        most = float(own[:, 11].max())
+        stiff = float((own[:, 11] * 2.0 * (own[:, 4] / self.dx) ** 2).max())
+        bits = sum_bits(self.count)
+        units = [
+            math.ldexp(1.0, math.frexp(bound)[1] - bits)
+            for bound in (most, most * DRIVE_MAX, stiff, most)
+        ]
+        at2 = float(int(own[0, 5]) >= MODELS["at2"])
+        return own.new_tensor([*units, at2, EMPTY * most])
 
     def _load(
         self, position: Tensor, values: dict[str, Tensor], row: Tensor, body: Tensor | None

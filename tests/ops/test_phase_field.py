@@ -9,27 +9,19 @@ from typing import Any
 import pytest
 import torch
 from law_states import KAPPA, MU, cast, rotate, rotations, states, strained
+from phase_scenes import DX, energy_and_momentum, plates, row, stepped
 from torch import Tensor
 
 from gsfluent import _core, ops
 from gsfluent.materials.phase_field import GRID_ENERGY, MODELS, SPLITS
-from gsfluent.ops.damage import DamageField, solve_drive
-from gsfluent.ops.plasticity import LAWS, weakened
+from gsfluent.ops.damage import solve_drive
+from gsfluent.ops.plasticity import LAWS
 from gsfluent.ops.reference import damage as dense
 from gsfluent.ops.reference import phase_field as reference
 from gsfluent.ops.reference import plasticity
 from gsfluent.ops.reference.tensors import to_matrix
 
 LAW = torch.tensor([LAWS["phase_field"]], dtype=torch.int32)
-DX = 0.01
-
-
-def row(
-    damage: float = 0.0, split: str = "volumetric", model: str = "at1", threshold: float = 500.0
-) -> Tensor:
-    code = float(SPLITS[split] + MODELS[model])
-    line = [MU, KAPPA, threshold, damage, 0.04, code, 1000.0, 0.1]
-    return torch.tensor([line], dtype=torch.float64)
 
 
 def still(count: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -381,53 +373,6 @@ def test_what_is_no_field_is_refused() -> None:
 # --- the resident solver ---
 
 
-def plates(dtype: torch.dtype, model: str = "at1", split: str = "none", more: bool = False) -> Any:
-    """Arguments of Solver: a block pulled apart fast enough to crack, in float64 positions."""
-    generator = torch.Generator().manual_seed(4)
-    x, y, z = (torch.arange(2 * n, dtype=torch.float64) + 0.5 for n in (14, 5, 5))
-    position = torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1).reshape(-1, 3)
-    noise = torch.rand(position.shape, generator=generator, dtype=torch.float64) - 0.5
-    position = 0.5 * DX * (position + 0.5 * noise)
-    count = position.shape[0]
-    volume = torch.full((count,), DX**3 / 8.0, dtype=dtype)
-    velocity = torch.zeros(count, 3, dtype=dtype)
-    velocity[:, 0] = (8.0 * (position[:, 0] / DX - 7.0)).sign() * 1.5
-    rows = row(0.0, split, model, 30.0)
-    rows[0, 4], rows[0, 7] = 2.0 * DX, 0.0
-    law, material = [9], torch.zeros(count, dtype=torch.int32)
-    if more:
-        rows = torch.cat([rows, rows.clone()])
-        rows[1, 2:6], law = 0.0, [9, 0]
-        material = (position[:, 1] > 3.0 * DX).int()
-    return {
-        "position": position, "velocity": velocity, "mass": 1000.0 * volume, "volume": volume,
-        "dx": DX, "law": torch.tensor(law, dtype=torch.int32), "params": rows.to(dtype),
-        "material": material, "alpha": torch.full((count,), -1.0, dtype=dtype),
-        "gravity": (0.0, 0.0, 0.0),
-    }  # fmt: skip
-
-
-def stepped(given: dict[str, Any], dt: float, steps: int) -> dict[str, Tensor]:
-    """The same by the composed operators."""
-    cracks = DamageField(given["law"], given["params"], given["material"])
-    x, v, dx, volume = given["position"], given["velocity"], given["dx"], given["volume"]
-    n = x.shape[0]
-    c, e, alpha = v.new_zeros(n, 3, 3), v.new_zeros(n, 6), given["alpha"]
-    peak, stress = torch.full_like(alpha, -1.0), v.new_zeros(n, 6)
-    for _ in range(steps):
-        blocks = ops.build_blocks(x, dx)
-        grid, _ = ops.p2g(
-            x, v, c, given["mass"], dx=dx, blocks=blocks, dt=dt, stress=stress, volume=volume
-        )
-        nodes, _, _ = ops.grid_update(grid, dx=dx, dt=dt, blocks=blocks, gravity=(0.0, 0.0, 0.0))
-        peak = cracks.step(alpha, peak, x, volume, dx=dx, blocks=blocks)
-        x, v, c, _ = ops.g2p(nodes, x, dx=dx, dt=dt, blocks=blocks)
-        law, params = weakened(given["law"], given["params"], given["material"], peak)
-        e, alpha, stress, _ = ops.return_mapping(e, alpha, dt * c, law=law, params=params)
-        peak = cracks.grown(peak, alpha) if cracks.points is None else peak
-    return {"position": x, "velocity": v, "strain": e, "alpha": alpha, "peak": peak}
-
-
 @pytest.mark.parametrize(
     ("model", "split", "more"),
     [("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False)],
@@ -477,16 +422,11 @@ def test_the_resident_solver_has_the_same_bits_in_any_order_and_threads() -> Non
 def test_a_break_keeps_momentum_and_makes_no_energy() -> None:
     given = plates(torch.float32, split="volumetric")
     solver = ops.Solver(**given)
-    mass = given["mass"].double()
     energies = []
     for _ in range(6):
-        v, c = solver.velocity.double(), solver.affine.double()
-        kinetic = 0.5 * (mass * ((v**2).sum(1) + 0.25 * DX**2 * (c**2).sum((1, 2)))).sum()
-        law, rows = weakened(given["law"], given["params"], given["material"], solver.peak)
-        stored = ops.elastic_energy(solver.strain, law=law, params=rows).double()
-        energies.append(float(kinetic + (stored * given["volume"].double()).sum()))
-        momentum = (mass[:, None] * v).sum(0)
-        assert momentum.abs().max() < 1e-6 * float((mass[:, None] * v.abs()).sum())
+        energy, momentum = energy_and_momentum(solver, given)
+        energies.append(energy)
+        assert momentum < 1e-6
         solver.advance(steps=25)
     assert float(solver.peak.max()) > 0.0
     assert all(b <= a * (1.0 + 1e-6) for a, b in itertools.pairwise(energies))
@@ -499,14 +439,3 @@ def test_the_solver_says_what_it_cannot_do() -> None:
     given["params"][1, 2:8] = torch.tensor([0.0, 0.0, 0.0, 0.0, 1000.0, 7.0])
     with pytest.raises(ValueError, match="phase_field"):
         ops.Solver(**given)
-
-
-@pytest.mark.cuda
-def test_the_solver_refuses_the_law_on_a_gpu_and_the_operators_agree() -> None:
-    given = plates(torch.float64)
-    there = {k: v.cuda() if isinstance(v, Tensor) else v for k, v in given.items()}
-    with pytest.raises(ValueError, match="phase_field"):
-        ops.Solver(**there)
-    want, have = stepped(given, 2e-4, 20), stepped(there, 2e-4, 20)
-    for name, value in want.items():
-        assert (have[name].cpu() - value).abs().max() <= 1e-9 * float(value.abs().max()), name

@@ -28,6 +28,27 @@ template <typename T>
 GSF_HOST_DEVICE int split_of(const MaterialRow<T>& m) {
   return int(m.damage) & 3;
 }
+template <typename T>
+GSF_HOST_DEVICE bool is_at2(const MaterialRow<T>& m) {
+  return (int(m.damage) & kModelAt2) != 0;
+}
+
+// Damage of a point with this peak.
+template <typename T>
+GSF_HOST_DEVICE T damage_of(T peak) {
+  return clamp(peak + T(kBrokenDamage), T(0), T(1));
+}
+
+// Whether the damage of a point is solved for: it has some, or is near its threshold.
+inline constexpr double kActiveDrive = 0.5, kActiveDriveAt2 = 1e-3;  // H / psi_t
+template <typename T>
+GSF_HOST_DEVICE T active_alpha(bool at2) {
+  return T((at2 ? kActiveDriveAt2 : kActiveDrive) - 1.0);
+}
+template <typename T>
+GSF_HOST_DEVICE bool takes_part(T alpha, T peak, T active) {
+  return alpha > active || peak > T(-kBrokenDamage);
+}
 
 // (J^2 - 1) - ln J^2 by its series, for |J^2 - 1| below a tenth.
 inline constexpr double kSeriesVolume = 0.1;

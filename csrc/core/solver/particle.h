@@ -16,7 +16,8 @@ inline constexpr double kWeakening = 0.02;
 
 // Laws a kernel is compiled for: fewer laws, fewer registers.
 // kMoreLaws: those of more_laws.h too (on the CPU solver_more.cpp).
-// kDamageField: elastic, NACC and phase_field; on the CPU only (cpu/solver/solver_fields.cpp).
+// kDamageField: elastic, NACC and phase_field (cpu/solver/solver_fields.cpp,
+// cuda/solver/damage.cu).
 // kViscousBrittle, kViscousAny: as kBrittle, kAnyLaw, with springs beside elastic and NACC matter
 // (core/material/viscous.h; on the CPU solver_viscous.cpp).
 enum LawSet : int {
@@ -121,6 +122,13 @@ GSF_HOST_DEVICE T momentum_bound(const T* velocity, const T* slope, T mass, T dx
   return largest;
 }
 
+// Which of the 27 blocks around a home holds the middle of the stencil of a particle.
+GSF_HOST_DEVICE int middle_block(uint32_t meta) {
+  int n = 0;
+  for (int axis = 0; axis < 3; ++axis) n = 3 * n + ((meta_cell(meta, axis) + 3) >> 2);
+  return n;
+}
+
 // Largest values of the particles of one thread, for the clock.
 struct Largest {
   float speed2, wave2, gradient2, bound;
@@ -130,6 +138,7 @@ struct StepFlags {
   bool plastic, guarded, inverted, invalid;
   bool leaves;  // close to the end of its window: new blocks are needed before the next step
   bool lost;    // past the end of its window
+  bool hot;     // its damage is solved for in the next step (kDamageField)
 };
 
 template <bool kWithField = false, typename T>
@@ -138,7 +147,7 @@ GSF_HOST_DEVICE MaterialRow<T> material_now(const SolverView<T>& s, uint32_t row
   if (s.irreversible && s.law[row] == kNacc)
     m.cohesion *= T(1) - clamp(peak / T(kWeakening), T(0), T(1));
   if constexpr (kWithField) {
-    if (s.law[row] == kPhaseField) m.cohesion = clamp(peak + T(kBrokenDamage), T(0), T(1));
+    if (s.law[row] == kPhaseField) m.cohesion = damage_of(peak);
   }
   return m;
 }
@@ -392,7 +401,10 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     whole = max(out.alpha, peak) < T(0) || law != kNacc;
     if constexpr (kLaws == kDamageField) {
       loses = loses || law == kPhaseField;
-      if (law == kPhaseField) whole = peak < T(0);
+      if (law == kPhaseField) {
+        whole = peak < T(0);
+        flags.hot = takes_part(out.alpha, peak, active_alpha<T>(is_at2(material)));
+      }
     }
     stress = out.stress;
     if (loses && material.exponent > T(0))

@@ -249,6 +249,13 @@ struct SolverView {
   uint64_t* holders;           // [S] ranks that hold the sums of each slot, as bits
   uint64_t* needers;           // [S] those of them that need its velocities
   int64_t* mail;               // [kMailWords + K * kImpulseSums] what a rank tells the others
+  // of phase-field matter, on CUDA (cuda/solver/damage.cu); or null
+  int64_t* damage_sums;    // [S, 64, 4] in units (core/solver/damage.h)
+  double* damage_nodes;    // [S, 64, 4] DamageNode
+  int32_t* damage_slots;   // [kDamagePlanes, S]
+  int32_t* damage_homes;   // [H] homes that meet slots that take part
+  int32_t* damage_counts;  // [3] slots of points to solve for, slots that take part, such homes
+  double* damage_scale;    // [6] units of the sums, 1 of AT2, volume of an empty node
 
   // Whether this rank answers for a slot: counts its contacts, books its impulses. The first does
   // that needs its velocities.

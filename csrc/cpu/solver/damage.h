@@ -1,25 +1,24 @@
-// The damage field of phase-field matter on the CPU: node sums of the points near damage, red-black
-// SOR within bounds, and back to the points. gsfluent/ops/damage.py says what; docs/theory/
-// phase-field.md why. Sums are in double, in an order that hangs on neither threads nor loading.
+// The damage field of phase-field matter on the CPU (core/solver/damage.h): node sums of the points
+// near damage, red-black SOR within bounds, and back to the points. Sums are in double, in an order
+// that hangs on neither threads nor loading.
 #pragma once
 
+#include "core/solver/damage.h"
 #include "cpu/solver/homes.h"
 
 namespace gsf::cpu {
-
-constexpr double kOmega = 1.5;
-constexpr int kSweeps = 4;
-constexpr double kActiveDrive = 0.5, kActiveDriveAt2 = 1e-3;
 
 template <typename T>
 class DamagePass {
  public:
   explicit DamagePass(const SolverView<T>& s) : s_(s) {
-    at2_ = false;
-    for (int64_t row = 0; row < s.row_count; ++row)
-      if (s.law[row] == kPhaseField)
-        at2_ = (int(load_material(s.rows + row * kRowColumns).damage) & kModelAt2) != 0;
-    active_ = T((at2_ ? kActiveDriveAt2 : kActiveDrive) - 1.0);
+    for (int64_t row = 0; row < s.row_count; ++row) {
+      if (s.law[row] != kPhaseField) continue;
+      const T* r = s.rows + row * kRowColumns;
+      at2_ = is_at2(load_material(r));
+      empty_ = std::max(empty_, kEmptyNode * double(r[kStressColumn]));
+    }
+    active_ = active_alpha<T>(at2_);
   }
 
   // Again after each build.
@@ -49,9 +48,9 @@ class DamagePass {
 
  private:
   bool is_phase(int64_t p) const { return s_.law[s_.row_of(s_.meta[p])] == kPhaseField; }
-  static T damage_of(T peak) { return gsf::clamp(peak + T(kBrokenDamage), T(0), T(1)); }
-  int32_t slot_at(const int32_t* b, int dx, int dy, int dz) const {
-    const uint64_t wanted = block_key(b[0] + dx, b[1] + dy, b[2] + dz, b[3]);
+  int32_t slot_around(const int32_t* b, int n) const {
+    const uint64_t wanted =
+        block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
     const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
     return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
   }
@@ -76,10 +75,8 @@ class DamagePass {
         });
         if (hot == 0) continue;
         for_particles(h, [&](int64_t p) {
-          if (!(s_.alpha[p] > active_ || s_.peak[p] > T(-kBrokenDamage)) || !is_phase(p)) return;
-          int n = 0;
-          for (int axis = 0; axis < 3; ++axis) n = 3 * n + ((meta_cell(s_.meta[p], axis) + 3) >> 2);
-          const int32_t slot = s_.neighbour[kNeighbours * h + n];
+          if (!takes_part(s_.alpha[p], s_.peak[p], active_) || !is_phase(p)) return;
+          const int32_t slot = s_.neighbour[kNeighbours * h + middle_block(s_.meta[p])];
           if (slot < 0 || slot >= c.slots) return;
           std::atomic_ref<int32_t>(number_[slot]).store(0, std::memory_order_relaxed);
           any.store(true, std::memory_order_relaxed);
@@ -93,8 +90,7 @@ class DamagePass {
       if (number_[i] == 0) seeds.push_back(static_cast<int32_t>(i));
     for (const int32_t seed : seeds)
       for (int n = 0; n < kNeighbours; ++n) {
-        const int32_t slot =
-            slot_at(s_.slot_coord + 4 * int64_t(seed), n / 9 - 1, n / 3 % 3 - 1, n % 3 - 1);
+        const int32_t slot = slot_around(s_.slot_coord + 4 * int64_t(seed), n);
         if (slot >= 0) number_[slot] = 0;
       }
     for (int64_t i = 0; i < c.slots; ++i)
@@ -145,10 +141,7 @@ class DamagePass {
           stencil.w[2]);
   }
 
-  // Sums of damage, history and stiffness times volume, and of volume; volumes in units of dx^2
-  // / 4.
-  using Sums = double __attribute__((vector_size(32)));
-  static constexpr int kDamage = 0, kDrive = 1, kStiff = 2, kVolume = 3;
+  using Sums = double __attribute__((vector_size(8 * kDamageSums)));
 
   void scatter() {
     nodes_.assign(slots_.size() * kBlockNodes, Sums{});
@@ -159,11 +152,10 @@ class DamagePass {
           for_particles(homes[i], [&](int64_t p) {
             const uint32_t row = s_.row_of(s_.meta[p]);
             if (s_.law[row] != kPhaseField) return;
-            const T* r = s_.rows + int64_t(row) * kRowColumns;
-            const double v = r[kStressColumn], length = double(r[4]) * double(s_.inv_dx);
-            const double drive = std::min(double(s_.alpha[p]) + 1.0, kDriveMax),
-                         d = damage_of(s_.peak[p]);
-            const Sums given{v * d, v * drive, v * 2.0 * length * length, v};
+            double of[kDamageSums];
+            damage_given(s_.rows + int64_t(row) * kRowColumns, s_.alpha[p], s_.peak[p], s_.inv_dx,
+                         of);
+            const Sums given{of[0], of[1], of[2], of[3]};
             for_rows(p, [&](int at, T across, const T* along) {
               const Sums part = double(across) * given;
               for (int k = 0; k < 3; ++k) sums[at + k] += double(along[k]) * part;
@@ -184,38 +176,27 @@ class DamagePass {
     parallel_for(count, 1, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
         const int32_t* coord = s_.slot_coord + 4 * int64_t(slots_[b]);
-        int32_t face[6];  // slots beyond the faces: x+, x-, y+, y-, z+, z-
-        for (int f = 0; f < 6; ++f) {
-          const int step = f % 2 == 0 ? 1 : -1;
-          face[f] =
-              slot_at(coord, f / 2 == 0 ? step : 0, f / 2 == 1 ? step : 0, f / 2 == 2 ? step : 0);
-        }
+        int32_t face[6];  // slots beyond the faces
+        for (int f = 0; f < 6; ++f) face[f] = slot_around(coord, face_block(f));
         for (int local = 0; local < kBlockNodes; ++local) {
           const int64_t n = b * kBlockNodes + local;
           const Sums& node = nodes_[n];
-          const double volume = node[kVolume], drive = node[kDrive];
-          if (!(volume > 0.0)) continue;
           Edge& e = edge_[n];
-          field_[n] = node[kDamage] / volume;
-          e.right = at2_ ? drive : drive - volume;
-          double whole = at2_ ? drive + 2.0 * volume : drive;
-          for (int f = 0; f < 6; ++f) {
-            const int shift = 4 - f / 2 * 2;  // of the axis in the local index
-            const int at = local >> shift & 3, to = f % 2 == 0 ? at + 1 : at - 1;
-            const int there = (local & ~(3 << shift)) | (to & 3) << shift;
-            const int32_t slot = to >= 0 && to < 4 ? slots_[b] : face[f];
-            if (slot < 0) continue;
-            if (number_[slot] < 0) {  // undamaged beyond
-              whole += node[kStiff];
-              continue;
-            }
+          const double sums[kDamageSums] = {node[0], node[1], node[2], node[3]};
+          const DamageNode now = damage_node(sums, at2_, empty_, [&](int f) {
+            bool inside;
+            const int there = face_node(local, f, inside);
+            const int32_t slot = inside ? slots_[b] : face[f];
+            if (slot < 0) return 0.0;
+            if (number_[slot] < 0) return node[kStiffSum];
             const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
-            if (!(nodes_[m][kVolume] > 0.0)) continue;
+            if (!(nodes_[m][kVolumeSum] > empty_)) return 0.0;
             e.near[f] = static_cast<int32_t>(m);
-            e.weight[f] = 0.5 * (node[kStiff] + nodes_[m][kStiff]);
-            whole += e.weight[f];
-          }
-          e.inverse = whole > 0.0 ? 1.0 / whole : 0.0;
+            return e.weight[f] = edge_weight(node[kStiffSum], nodes_[m][kStiffSum]);
+          });
+          field_[n] = now.value;
+          e.right = now.right;
+          e.inverse = now.inverse;
         }
       }
     });
@@ -227,14 +208,13 @@ class DamagePass {
       parallel_for(count, 8, [&](int64_t begin, int64_t end) {
         for (int64_t b = begin; b < end; ++b)
           for (int local = 0; local < kBlockNodes; ++local) {
-            // blocks are four wide: the parity of a node is that of its place in the block
-            if (((local >> 4) + (local >> 2) + local) % 2 != sweep % 2) continue;
+            if (node_colour(local) != sweep % 2) continue;
             const Edge& e = edge_[b * kBlockNodes + local];
             if (e.inverse == 0.0) continue;
             double sum = e.right;
             for (int f = 0; f < 6; ++f) sum += e.weight[f] * field_[e.near[f]];
             double& d = field_[b * kBlockNodes + local];
-            d = std::clamp(d + kOmega * (sum * e.inverse - d), 0.0, 1.0);
+            d = relaxed(d, sum, e.inverse);
           }
       });
   }
@@ -257,8 +237,7 @@ class DamagePass {
               const T* f = field + at;
               found += across * (along[0] * f[0] + along[1] * f[1] + along[2] * f[2]);
             });
-            const T d = std::max(damage_of(s_.peak[p]), std::min(found, T(1)));
-            if (d > T(0)) s_.peak[p] = std::max(s_.peak[p], d - T(kBrokenDamage));
+            s_.peak[p] = peak_after(s_.peak[p], found);
           });
         }
       });
@@ -270,7 +249,8 @@ class DamagePass {
   };
 
   const SolverView<T>& s_;
-  bool at2_;
+  bool at2_ = false;
+  double empty_ = 0.0;
   T active_;  // alpha from which a point takes part
   std::vector<uint64_t> keys_;
   std::vector<int32_t> colors_[kColors], homes_[kColors];  // homes by colour; those that take part

@@ -24,6 +24,7 @@ cudaError_t solver_build(const SolverView<T>& s, cudaStream_t stream) {
     carry_kernel<T, true><<<ctas(s.count), kThreads, 0, stream>>>(s, pass);
   }
   bound_kernel<T><<<homes, kThreads, 0, stream>>>(s);
+  if (s.damage_counts != nullptr) solver_damage_marks(s, stream);
   finish_kernel<T><<<1, 1, 0, stream>>>(s);
   return cudaGetLastError();
 }

@@ -1,6 +1,7 @@
 // Nodes to particles with the material laws, and what the last warp of a step does.
 #pragma once
 
+#include "core/solver/damage.h"
 #include "cuda/solver/p2g.h"
 
 namespace gsf::cuda {
@@ -9,7 +10,9 @@ namespace {
 constexpr int kG2PThreads = 128;  // as kP2GThreads
 // CTAs of a multiprocessor: more for the laws that need fewer registers.
 constexpr int g2p_ctas(int laws, bool keeps) {
-  return keeps ? 4 : (laws == kElasticOnly ? 7 : (with_springs(laws) ? 5 : 6));
+  if (keeps) return 4;
+  if (with_springs(laws)) return 5;
+  return laws == kElasticOnly ? 7 : 6;
 }
 
 // Brings the line at p near; nothing waits for it.
@@ -110,6 +113,20 @@ __device__ void gather_window(const T (&tile)[3][kTile], int base, const Stencil
   gather_stencil(st, node, row, value, moment);
 }
 
+// Step of which a mark in SolverView::damage_slots tells; 0 is none.
+__device__ inline int32_t damage_stamp(int64_t step) { return static_cast<int32_t>(step + 1); }
+// Lists the slot in the middle of a point whose damage is solved for; `neighbour` is its home's.
+template <typename T>
+__device__ void mark_slot(const SolverView<T>& s, const int32_t* neighbour, uint32_t meta,
+                          int32_t stamp) {
+  const int32_t slot = neighbour[middle_block(meta)];
+  if (slot < 0 || slot >= s.slot_capacity) return;
+  int32_t* mark = s.damage_slots + kHotPlane * s.slot_capacity + slot;
+  if (*mark == stamp || atomicExch(mark, stamp) == stamp) return;
+  const int32_t at = atomicAdd(s.damage_counts + kHotCount, 1);
+  s.damage_slots[kHotList * s.slot_capacity + at] = slot;
+}
+
 // kKeeps: for points that keep a share of their own motion (cuda/solver/flip.cu).
 template <typename T, int kLaws, bool kTrack, bool kKeeps>
 __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws, kKeeps))
@@ -155,6 +172,9 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws, kKeeps))
       gather_window(tile, base, st, value, moment);
       flags = finish_particle<T, kLaws, kTrack, kKeeps>(s, first + r, before, reach, value, moment,
                                                         dt, dt_next, waves, slack, largest);
+      if constexpr (kLaws == kDamageField)
+        if (flags.hot)
+          mark_slot(s, neighbour, load_meta(s, first + r), damage_stamp(clock.step + 1));
     }
     if constexpr (kLaws != kElasticOnly) count_lanes(flags.plastic, &s.clock->plastic);
     if (__any_sync(kAllLanes, flags.guarded || flags.inverted || flags.invalid)) {

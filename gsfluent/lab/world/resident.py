@@ -22,8 +22,8 @@ def why_not(scene: Scene, forced: bool) -> str:
         return "it has no periodic axes"
     laws = {int(law) for law in scene.law.tolist()}
     beside = {LAWS[name] for name in ("elastic", "nacc", "phase_field")}
-    if LAWS["phase_field"] in laws and (scene.law.is_cuda or not laws <= beside):
-        return "phase_field works on the CPU beside elastic and nacc only"
+    if LAWS["phase_field"] in laws and not laws <= beside:
+        return "phase_field works beside elastic and nacc only"
     if scene.cfl > 1.0:
         return "its cfl is at most 1"
     return ""

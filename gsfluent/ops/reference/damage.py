@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.reference.mpm import stencil
-from gsfluent.ops.reference.phase_field import DRIVE_MAX
+from gsfluent.ops.reference.phase_field import DRIVE_MAX, EMPTY
 
 OMEGA = 1.5
 """Over-relaxation."""
@@ -52,10 +52,12 @@ def damage_solve(
         out = value.new_zeros(size[0] * size[1] * size[2])
         return out.index_add(0, flat, (weight * value[:, None]).reshape(-1)).view(size)
 
-    v, drive = total(volume), drive.clamp(max=DRIVE_MAX)
-    vh = total(volume * drive)
-    vk = total(volume * 2.0 * length**2 / dx**2)
-    there = v > 0
+    drive = drive.clamp(max=DRIVE_MAX)
+    there = total(volume) > EMPTY * volume.max()
+    v, vh, vk = (
+        torch.where(there, total(volume * factor), 0.0)
+        for factor in (torch.ones_like(drive), drive, 2.0 * length**2 / dx**2)
+    )
     d = torch.where(there, total(volume * damage) / torch.where(there, v, 1.0), 0.0)
     diagonal, right = (vh, vh - v) if model == "at1" else (vh + 2.0 * v, vh)
     index = torch.meshgrid(*(torch.arange(s) for s in size), indexing="ij")

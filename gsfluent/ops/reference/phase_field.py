@@ -31,6 +31,8 @@ BROKEN = 0.95
 """Damage of a broken point."""
 DRIVE_MAX = 1e4
 """Largest history over the threshold that is kept."""
+EMPTY = 2.0**-24
+"""Volume below which a node is empty, over that of the largest point (``kEmptyNode``)."""
 VOLUME_MAX, SHEAR_MAX = 0.44, 0.5
 """What broken matter remembers of its opening, J^2 - 1, and of its shear, |d|."""
 

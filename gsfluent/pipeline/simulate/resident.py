@@ -71,7 +71,7 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         matter: The points, for the heaviest density and the grid spacing.
     """
     known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
-    if matter.has_field and (matter.law.is_cuda or not bool(torch.isin(matter.law, known).all())):
+    if matter.has_field and not bool(torch.isin(matter.law, known).all()):
         return False  # not there yet
     if matter.viscous and (
         matter.has_field or bool(compiled_apart(matter.law, matter.params).any())

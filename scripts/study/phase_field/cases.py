@@ -22,7 +22,7 @@ from gsfluent.fracturebench.shapes import elastic, free
 from gsfluent.lab.frozen.answer import rows, run_case
 from gsfluent.lab.world.driver import World
 from gsfluent.ops.collider import collider_row
-from gsfluent.ops.damage import DamageField
+from gsfluent.ops.damage import DamageField, damage_of
 from gsfluent.ops.plasticity import weakened
 
 GLASS = (1e9, 0.2, 1000.0)
@@ -71,8 +71,8 @@ class Energies:
         self.rows.append((world.kinetic(), float((stored * volume).sum()), float(surface)))
 
 
-def _run(scene: Scene, watch: Energies | None = None, law: str = "phase_field") -> Run:
-    run = run_case(scene, law=law, watch=watch)
+def _run(scene: Scene, device: str, watch: Energies | None = None) -> Run:
+    run = run_case(scene, law="phase_field", watch=watch, device=device)
     if run.failed:
         raise FloatingPointError(run.failed)
     return run
@@ -86,7 +86,7 @@ def _damage(run: Run) -> np.ndarray:
 # --- the strip: what a running crack costs, and when it runs ---
 
 
-def strip(cells: float, release: float, place: float) -> Done:
+def strip(cells: float, release: float, place: float, device: str) -> Done:
     """A strip 24 l high that is held stretched, the crack ``place`` cells off the grid."""
     dx = 1.0 / 24.0 / cells  # the strip is 1 m high
     length, speed = cells * dx, rayleigh_speed(*GLASS)
@@ -95,7 +95,7 @@ def strip(cells: float, release: float, place: float) -> Done:
         samples=40, shift=place, seed=round(100 * place),
     )  # fmt: skip
     energies = Energies()
-    run = _run(scene, energies)
+    run = _run(scene, device, energies)
     reach = cracks.reach_of(scene, _damage(run), 0.6)
     found: dict[str, Any] = {"release": release, "reach": float(reach[-1]), "cells": cells}
     # between a quarter and nine tenths of the free way, where the crack runs evenly
@@ -112,11 +112,11 @@ def strip(cells: float, release: float, place: float) -> Done:
 # --- plates of FractureBench ---
 
 
-def branching(cells: float, length: float = 5e-4) -> Done:
+def branching(cells: float, length: float, device: str) -> Done:
     """The forking crack of Borden et al. at their own length."""
     scene = cracks.branching_plate(length / cells, 8, length)
     energies = Energies()
-    run = _run(scene, energies)
+    run = _run(scene, device, energies)
     most, speed, off = judge(scene, run)
     rows = np.array(energies.rows)
     done = rows[0].sum() - rows.sum(axis=1)  # 0 if energy is kept: the layers are part of it
@@ -133,10 +133,10 @@ def branching(cells: float, length: float = 5e-4) -> Done:
     return found, scene, run
 
 
-def notch(cells: float, prefer: str, length: float = 1.5e-5) -> Done:
+def notch(cells: float, prefer: str, length: float, device: str) -> Done:
     """The notched square of Miehe et al."""
     scene = cracks.notched_square(length / cells, 8, length, 30.0, prefer)
-    run = _run(scene)
+    run = _run(scene, device)
     force, moved, off = judge(scene, run)
     found = {"force": force.value, "moved": moved.value, "off": off.value}
     forces, way = cracks.pulled(scene, run)
@@ -144,25 +144,25 @@ def notch(cells: float, prefer: str, length: float = 1.5e-5) -> Done:
     return found, scene, run
 
 
-def pmma(release: float, dx: float) -> Done:
+def pmma(release: float, dx: float, device: str) -> Done:
     """The strip of Bleyer et al. at a release of energy over the toughness."""
     scene = cracks.stretched_strip(
         "pmma_strip", cracks.PMMA, cracks.PMMA_TOUGHNESS, (0.032, 0.016), 0.004, release, dx, 8,
         2.0 * dx, 60e-6,
     )  # fmt: skip
-    run = _run(scene)
+    run = _run(scene, device)
     share, speed = judge(scene, run)
     return {"release": release, "share": share.value, "speed": speed.value}, scene, run
 
 
-def kalthoff(cells: int, split: str) -> Done:
+def kalthoff(cells: int, split: str, device: str) -> Done:
     """Kalthoff and Winkler's plate with the toughness of its phase-field papers, 22 130 J/m^2."""
     plain = find("kalthoff").build(0.1 / cells, 8)
     steel = plain.materials[1] | {
         "fracture_energy": 22130.0, "split": split, "length": 2.0 * plain.dx,
     }  # fmt: skip
     scene = dataclasses.replace(plain, materials=(plain.materials[0], steel))
-    run = _run(scene)
+    run = _run(scene, device)
     angle, length = judge(scene, run)
     return {"angle": angle.value, "length": length.value}, scene, run
 
@@ -170,7 +170,7 @@ def kalthoff(cells: int, split: str) -> Done:
 # --- three-point bending ---
 
 
-def bending(cells: float, prefer: str, length: float = 6e-5) -> Done:
+def bending(cells: float, prefer: str, length: float, device: str) -> Done:
     """The notched beam of Miehe et al.: 8 x 2 mm on two supports, pressed down in the middle."""
     dx = length / cells
     wide, high, deep = 8e-3, 2e-3, 4e-4
@@ -210,14 +210,14 @@ def bending(cells: float, prefer: str, length: float = 6e-5) -> Done:
     world = World(
         torch.from_numpy(scene.x), (0.0, 0.0, 0.0), volume=torch.from_numpy(scene.volume), dx=dx,
         law=law, params=params, material=torch.from_numpy(scene.material), alpha=alpha,
-        colliders=torch.stack([*planes, *bars]), dtype=torch.float32,
+        colliders=torch.stack([*planes, *bars]), dtype=torch.float32, device=device,
     )  # fmt: skip
     given, seen, x = [0.0], [], []
     for end in times:
         world.run(seconds=float(end) - world.time)
         given.append(float(world.impulse[-1, 1]))
-        seen.append((world.peak.double() + 1.0).clamp(0.0, 1.0).numpy())
-        x.append(world.position.double().numpy())
+        seen.append(damage_of(world.peak.double()).cpu().numpy())
+        x.append(world.position.double().cpu().numpy())
     force = -np.diff(given) / np.diff([0.0, *times]) / dx
     way = speed * (times - 0.5 * times[0])
     at = int(np.argmax(force))
@@ -231,8 +231,8 @@ def bending(cells: float, prefer: str, length: float = 6e-5) -> Done:
     return found | {"curve": [way.tolist(), force.tolist()]}, scene, run
 
 
-def jobs(quick: bool) -> list[Job]:
-    """All jobs; ``quick``: one small one of each test."""
+def jobs(quick: bool, device: str) -> list[Job]:
+    """All jobs on a device; ``quick``: one small one of each test."""
     made: list[Job] = []
     wide = 4.0 if quick else 1.0
 
@@ -244,31 +244,34 @@ def jobs(quick: bool) -> list[Job]:
             for place in (0.25,) if quick else (0.0, 0.25, 0.5, 0.75):
                 add(
                     "strip", f"{cells}_{release:g}_{place:g}", f"{cells} dx", 1.5 * cells**3,
-                    lambda c=cells, r=release, p=place: strip(c, r, p),
+                    lambda c=cells, r=release, p=place: strip(c, r, p, device),
                 )  # fmt: skip
     for cells in (2, 3)[: 1 if quick else 2]:
         add(
             "branching", f"{cells}", f"{cells} dx", 13.0 * cells**3,
-            lambda c=cells: branching(c, wide * 5e-4),
+            lambda c=cells: branching(c, wide * 5e-4, device),
         )  # fmt: skip
         for prefer in ("toughness", "strength"):
             add(
                 "notch", f"{cells}_{prefer}", f"{cells} dx, {prefer}", 18.0 * cells**3,
-                lambda c=cells, p=prefer: notch(c, p, wide * 1.5e-5),
+                lambda c=cells, p=prefer: notch(c, p, wide * 1.5e-5, device),
             )  # fmt: skip
             if cells > 2:
                 continue
             add(
                 "bending", f"{cells}_{prefer}", f"{cells} dx, {prefer}", 40.0 * cells**3,
-                lambda c=cells, p=prefer: bending(c, p, wide * 6e-5),
+                lambda c=cells, p=prefer: bending(c, p, wide * 6e-5, device),
             )  # fmt: skip
     for release in (2.6,) if quick else (1.2, 1.6, 2.0, 2.6, 3.2):
-        dx = 4e-4 if quick else 1e-4
-        add("pmma", f"{release:g}", "2 dx", 130.0, lambda r=release, d=dx: pmma(r, d))
+        for dx, cost in ((4e-4, 2.0),) if quick else ((1e-4, 130.0), (5e-5, 1100.0)):
+            add(
+                "pmma", f"{2e3 * dx:g}_{release:g}", f"{2e3 * dx:g} mm", cost,
+                lambda r=release, d=dx: pmma(r, d, device),
+            )  # fmt: skip
     for split in ("spectral", "volumetric"):
         for count in (48,) if quick else (64, 128, 192):
             add(
                 "kalthoff", f"{count}_{split}", f"{count} cells, {split}", (count / 32.0) ** 3,
-                lambda c=count, s=split: kalthoff(c, s),
+                lambda c=count, s=split: kalthoff(c, s, device),
             )  # fmt: skip
     return made

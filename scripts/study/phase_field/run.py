@@ -1,11 +1,12 @@
 """The long tests of the phase-field law, measured and entered into docs/measured/phase_field.md.
 
     python scripts/study/phase_field/run.py OUT [--processes 8] [--only TEST,...] [--quick]
+        [--device cuda]
     python scripts/study/phase_field/run.py OUT --enter
 
 Each job is a process of its own with OMP_NUM_THREADS threads and leaves NAME.json and NAME.npz in
-OUT; what is there is not run again. All jobs take about two hours of one core, a quarter of an hour
-on sixteen. --enter writes the page and its picture from what OUT holds.
+OUT; what is there is not run again. All jobs take about four hours of one core; on a GPU they take
+minutes. --enter writes the page and its picture from what OUT holds.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from gsfluent.lab.charts.record import machine
 PAGE = tables.ROOT / "docs" / "measured" / "phase_field.md"
 
 
-def work(job: Job, out: Path) -> None:
+def work(job: Job, out: Path, device: str) -> None:
     """Run a job and write its files."""
     begin, spent = time.perf_counter(), time.process_time()
     found, scene, run = job.work()
@@ -39,7 +40,7 @@ def work(job: Job, out: Path) -> None:
     found |= {
         "test": job.test, "setting": job.setting, "points": scene.count, "steps": run.steps,
         "dx": scene.dx, "wall": time.perf_counter() - begin, "cpu": time.process_time() - spent,
-        "threads": torch.get_num_threads(), "machine": machine("cpu"),
+        "threads": torch.get_num_threads(), "machine": machine(device),
     }  # fmt: skip
     with atomic_path(out / f"{job.name}.npz") as path, path.open("wb") as file:
         np.savez_compressed(
@@ -59,6 +60,7 @@ def in_parallel(chosen: list[Job], args: argparse.Namespace) -> int:
         while waiting and len(running) < args.processes:
             job = waiting.pop()
             command = [sys.executable, __file__, str(args.out), "--job", job.name]
+            command += ["--device", args.device]
             command += ["--quick"] if args.quick else []
             running[job.name] = subprocess.Popen(command, env=os.environ)
         time.sleep(0.05)
@@ -84,16 +86,17 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEST,...", help="tests; default all")
     parser.add_argument("--quick", action="store_true", help="one small run of each test")
     parser.add_argument("--enter", action="store_true", help="write the page")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--job", default="", help=argparse.SUPPRESS)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     if args.enter:
         tables.enter_page(records(args.out), args.out, PAGE)
         return 0
-    known = jobs(args.quick)
+    known = jobs(args.quick, args.device)
     if args.job:
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-        work(next(job for job in known if job.name == args.job), args.out)
+        work(next(job for job in known if job.name == args.job), args.out, args.device)
         return 0
     only = set(filter(None, args.only.split(",")))
     if wrong := only - {job.test for job in known}:

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import pytest
 import torch
-from simulation_shapes import ellipsoid
+from simulation_scenes import CLAY, dropped
 
 from gsfluent import materials
 from gsfluent.errors import InputError
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.pipeline.simulate.stage import Simulate
-from gsfluent.scene.scene import Scene
 from gsfluent.stages.findings import lowered
 
-BRITTLE = materials.Material(
-    "clay", law="phase_field", young_modulus=2e5, poisson_ratio=0.25, density=1200.0,
-    toughness=40.0, tensile_strength=9e3, prefer="strength",
-)  # fmt: skip
 DX = 0.03
 
 
-def dropped(material: materials.Material, height: float) -> Scene:
-    scene = Scene()
-    scene.add(ellipsoid((0.1, 0.1, 0.1)), material)
-    scene.drop(height)
-    return scene
-
-
 def test_a_hard_landing_cracks_and_costs_energy() -> None:
-    simulation = Simulate(dx=DX)(dropped(BRITTLE, 0.6), fps=100, seconds=0.41)
+    simulation = Simulate(dx=DX)(dropped(CLAY, 0.6), fps=100, seconds=0.41)
     frames = [f for f in simulation if f.index in (0, 36, 40)]
     report = simulation.report
     assert report["verdict"] == "clean" and report["momentum_error"] < 1e-5
@@ -43,7 +31,7 @@ def test_a_hard_landing_cracks_and_costs_energy() -> None:
 
 
 def test_a_soft_landing_leaves_it_whole() -> None:
-    strong = BRITTLE.override(tensile_strength=9e4)
+    strong = CLAY.override(tensile_strength=9e4)
     simulation = Simulate(dx=DX)(dropped(strong, 0.02), fps=50, seconds=0.09)
     last = list(simulation)[-1]
     assert last.energy["surface"] == 0.0 and not bool(last.broken.any())
@@ -51,23 +39,23 @@ def test_a_soft_landing_leaves_it_whole() -> None:
 
 
 def test_plan_says_what_two_cells_bind() -> None:
-    (said_of_toughness,) = lowered(dropped(BRITTLE.override(tensile_strength=4e4), 0.2), DX)
+    (said_of_toughness,) = lowered(dropped(CLAY.override(tensile_strength=4e4), 0.2), DX)
     assert "bind" in said_of_toughness and "times its toughness" in said_of_toughness
-    tough = BRITTLE.override(toughness=4.0, prefer="toughness", tensile_strength=4e4)
+    tough = CLAY.override(toughness=4.0, prefer="toughness", tensile_strength=4e4)
     (said_of_strength,) = lowered(dropped(tough, 0.2), DX)
     assert "bind" in said_of_strength and "of the strength are left" in said_of_strength
 
 
 def test_the_grid_keeps_what_is_preferred() -> None:
-    length, strong, tough = materials.phase_field.kept(BRITTLE.override(toughness=4.0), DX)
+    length, strong, tough = materials.phase_field.kept(CLAY.override(toughness=4.0), DX)
     assert length == 2.0 * DX and strong == pytest.approx(1.0) and tough > 10.0
-    weak = BRITTLE.override(toughness=4.0, prefer="toughness", tensile_strength=4e4)
+    weak = CLAY.override(toughness=4.0, prefer="toughness", tensile_strength=4e4)
     _, strong, tough = materials.phase_field.kept(weak, DX)
     assert strong < 0.5 and tough == 1.0
 
 
 def test_a_length_below_two_cells_is_refused() -> None:
-    scene = dropped(BRITTLE.override(length=0.04), 0.1)
+    scene = dropped(CLAY.override(length=0.04), 0.1)
     with pytest.raises(InputError, match=r"length must be at least 2 cells"):
         build_matter(scene, DX)
 

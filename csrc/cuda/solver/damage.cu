@@ -1,0 +1,304 @@
+// Phase-field matter on the GPU: the damage field of a step, then g2p with its law. On the CPU:
+// cpu/solver/damage.h; what both do: core/solver/damage.h.
+//
+// Where nothing is near its threshold the field costs one kernel that ends at once. Elsewhere that
+// kernel does all of it, and its CTAs wait for each other between the parts (a cooperative launch):
+// a dozen kernels in a row would cost unbroken matter more than everything else here. Lists are in
+// whatever order; sums are whole numbers, and a node is relaxed from nodes of the other colour.
+#include <cooperative_groups.h>
+
+#include "cuda/solver/g2p.h"
+
+namespace gsf::cuda {
+namespace {
+
+// Threads of a CTA, and CTAs of a multiprocessor, all of which run at once.
+constexpr int kDamageThreads = 512, kDamageCtas = 2;
+
+// After a build slots have other numbers.
+template <typename T>
+__global__ void __launch_bounds__(kSolverThreads)
+    unmark_kernel(const __grid_constant__ SolverView<T> s) {
+  if (!may_build(*s.clock)) return;
+  const int64_t i = int64_t(blockIdx.x) * kSolverThreads + threadIdx.x;
+  if (i < s.slot_capacity)
+    for (const int plane : {kHotPlane, kActivePlane})
+      s.damage_slots[plane * s.slot_capacity + i] = 0;
+  if (i <= kHomeCount) s.damage_counts[i] = 0;
+}
+template <typename T>
+__global__ void __launch_bounds__(kSolverThreads)
+    mark_kernel(const __grid_constant__ SolverView<T> s) {
+  const SolverClock& clock = *s.clock;
+  if (!may_build(clock) || int64_t(blockIdx.x) >= clock.wanted_homes) return;
+  const HomeList<T>& homes = s.next_homes();
+  const int64_t first = homes.start[blockIdx.x], count = homes.count[blockIdx.x];
+  const int32_t* neighbour = s.neighbour + int64_t(blockIdx.x) * kNeighbours;
+  const T active = active_alpha<T>(s.damage_scale[kScaleAt2] != 0.0);
+  for (int64_t r = threadIdx.x; r < count; r += kSolverThreads) {
+    const int64_t p = first + r;
+    if (p < 0 || p >= s.count || !takes_part(s.alpha[p], s.peak[p], active)) continue;
+    const uint32_t meta = load_meta(s, p);
+    if (s.law[s.row_of(meta)] == kPhaseField)
+      mark_slot(s, neighbour, meta, damage_stamp(clock.step));
+  }
+}
+
+// What the parts of the solve share.
+template <typename T>
+struct Solve {
+  const SolverView<T>& s;
+  int32_t stamp;
+  int64_t thread, threads;  // of the whole grid
+
+  __device__ int32_t* plane(int which) const { return s.damage_slots + which * s.slot_capacity; }
+  __device__ bool active(int32_t slot) const {
+    return slot >= 0 && slot < s.slot_capacity && plane(kActivePlane)[slot] == stamp;
+  }
+  __device__ DamageNode* nodes(int64_t slot) const {
+    return reinterpret_cast<DamageNode*>(s.damage_nodes) + slot * kBlockNodes;
+  }
+  // Slot beyond face f of a slot, where `inside` is not this one; below 0: what stands there.
+  __device__ int32_t beyond(int32_t slot, int f, bool inside) const {
+    return inside ? slot : plane(kFaces + f)[slot];
+  }
+
+  // Slots of points to solve for and those around them.
+  __device__ void spread() const {
+    if (thread == 0) s.damage_counts[kHomeCount] = 0;
+    const int64_t work = int64_t(s.damage_counts[kHotCount]) * kNeighbours;
+    for (int64_t i = thread; i < work; i += threads) {
+      const int64_t hot = plane(kHotList)[i / kNeighbours];
+      const int32_t slot =
+          slot_around(s, s.slot_coord + 4 * hot, static_cast<int>(i % kNeighbours));
+      if (slot < 0 || slot >= s.slot_capacity) continue;
+      if (atomicExch(plane(kActivePlane) + slot, stamp) == stamp) continue;
+      plane(kActiveList)[atomicAdd(s.damage_counts + kActiveCount, 1)] = slot;
+    }
+  }
+
+  // Homes that meet them, what lies beyond their faces; their sums are cleared.
+  __device__ void list() const {
+    if (thread == 0) s.damage_counts[kHotCount] = 0;
+    for (int64_t h = thread; h < s.clock->homes; h += threads) {
+      bool meets = false;
+      for (int n = 0; n < kNeighbours && !meets; ++n)
+        meets = active(s.neighbour[h * kNeighbours + n]);
+      if (meets)
+        s.damage_homes[atomicAdd(s.damage_counts + kHomeCount, 1)] = static_cast<int32_t>(h);
+    }
+    const int64_t slots = s.damage_counts[kActiveCount];
+    for (int64_t i = thread; i < slots * kBlockNodes; i += threads) {
+      const int64_t node =
+          int64_t(plane(kActiveList)[i / kBlockNodes]) * kBlockNodes + i % kBlockNodes;
+      longlong2* words = reinterpret_cast<longlong2*>(s.damage_sums + kDamageSums * node);
+      words[0] = words[1] = longlong2{0, 0};
+    }
+    for (int64_t i = thread; i < slots * 6; i += threads) {
+      const int32_t slot = plane(kActiveList)[i / 6];
+      const int f = static_cast<int>(i % 6);
+      const int32_t other = slot_around(s, s.slot_coord + 4 * int64_t(slot), face_block(f));
+      plane(kFaces + f)[slot] = other < 0 ? kNoBlock : (active(other) ? other : kUndamaged);
+    }
+  }
+
+  // Sums of the points of one home, by a CTA.
+  __device__ void scatter(int64_t home, unsigned long long (&tile)[kDamageSums][kTile]) const {
+    for (int i = threadIdx.x; i < kDamageSums * kTile; i += kDamageThreads) (&tile[0][0])[i] = 0;
+    __syncthreads();
+    const HomeList<T>& homes = s.homes();
+    const int64_t first = homes.start[home];
+    const int64_t count = min(int64_t(homes.count[home]), s.count - first);
+    double per_unit[kDamageSums];
+    for (int c = 0; c < kDamageSums; ++c) per_unit[c] = 1.0 / s.damage_scale[c];
+    for (int64_t r = threadIdx.x; first >= 0 && r < count; r += kDamageThreads) {
+      const int64_t p = first + r;
+      T offset[3];
+      const uint32_t meta = load_place(s, p, offset);
+      const uint32_t row = s.row_of(meta);
+      if (s.law[row] != kPhaseField) continue;
+      double given[kDamageSums];
+      damage_given(s.rows + int64_t(row) * kRowColumns, s.alpha[p], s.peak[p], s.inv_dx, given);
+      for (int c = 0; c < kDamageSums; ++c) given[c] *= per_unit[c];
+      const Stencil<T> st = stencil_at(offset);
+      const int base = window_base(meta);
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+          const double across = double(st.w[0][i] * st.w[1][j]);
+          for (int k = 0; k < 3; ++k) {
+            const double w = across * double(st.w[2][k]);
+            const int at = base + i * kStrideX + j * kStrideY + k;
+            for (int c = 0; c < kDamageSums; ++c)
+              if (given[c] != 0.0)
+                atomicAdd(&tile[c][at],
+                          static_cast<unsigned long long>(__double2ll_rn(w * given[c])));
+          }
+        }
+    }
+    __syncthreads();
+    const int32_t* neighbour = s.neighbour + home * kNeighbours;
+    for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
+      int i, j, k;
+      const int at = window_node(index, i, j, k);
+      if (!active(neighbour[neighbour_of(i, j, k)])) continue;
+      int64_t* sums = s.damage_sums + kDamageSums * slot_node(neighbour, i, j, k);
+      for (int c = 0; c < kDamageSums; ++c)
+        if (tile[c][at] != 0) add_units(sums + c, static_cast<long long>(tile[c][at]));
+    }
+  }
+
+  // The equation of every node.
+  __device__ void prepare() const {
+    const bool at2 = s.damage_scale[kScaleAt2] != 0.0;
+    const double empty = s.damage_scale[kScaleEmpty];
+    double unit[kDamageSums];
+    for (int c = 0; c < kDamageSums; ++c) unit[c] = s.damage_scale[c];
+    const int64_t work = int64_t(s.damage_counts[kActiveCount]) * kBlockNodes;
+    for (int64_t i = thread; i < work; i += threads) {
+      const int32_t slot = plane(kActiveList)[i / kBlockNodes];
+      const int local = static_cast<int>(i % kBlockNodes);
+      const int64_t* units = s.damage_sums + kDamageSums * (int64_t(slot) * kBlockNodes + local);
+      double sums[kDamageSums];
+      for (int c = 0; c < kDamageSums; ++c) sums[c] = double(units[c]) * unit[c];
+      nodes(slot)[local] = damage_node(sums, at2, empty, [&](int f) {
+        bool inside;
+        const int there = face_node(local, f, inside);
+        const int32_t other = beyond(slot, f, inside);
+        if (other < 0) return other == kUndamaged ? sums[kStiffSum] : 0.0;
+        const int64_t* far = s.damage_sums + kDamageSums * (int64_t(other) * kBlockNodes + there);
+        if (!(double(far[kVolumeSum]) * unit[kVolumeSum] > empty)) return 0.0;
+        return edge_weight(sums[kStiffSum], double(far[kStiffSum]) * unit[kStiffSum]);
+      });
+    }
+  }
+
+  // One colour once. Nodes without matter hold 0, and so pull at nobody.
+  __device__ void relax(int colour) const {
+    const int64_t work = int64_t(s.damage_counts[kActiveCount]) * (kBlockNodes / 2);
+    for (int64_t i = thread; i < work; i += threads) {
+      const int32_t slot = plane(kActiveList)[i / (kBlockNodes / 2)];
+      const int even = 2 * static_cast<int>(i % (kBlockNodes / 2));
+      const int local = even + (node_colour(even) != colour ? 1 : 0);
+      DamageNode& node = nodes(slot)[local];
+      const DamageNode now = node;
+      if (now.inverse == 0.0) continue;
+      double sum = now.right;
+      for (int f = 0; f < 6; ++f) {
+        bool inside;
+        const int there = face_node(local, f, inside);
+        const int32_t other = beyond(slot, f, inside);
+        if (other < 0) continue;
+        const DamageNode& far = nodes(other)[there];
+        sum += edge_weight(now.stiff, far.stiff) * far.value;
+      }
+      node.value = relaxed(now.value, sum, now.inverse);
+    }
+  }
+
+  // The field back to the points of one home, by a CTA.
+  __device__ void gather(int64_t home, T (&tile)[kTile]) const {
+    const int32_t* neighbour = s.neighbour + home * kNeighbours;
+    bool any = false;
+    for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
+      int i, j, k;
+      const int at = window_node(index, i, j, k);
+      const int32_t slot = neighbour[neighbour_of(i, j, k)];
+      const int local = local_index(window_local(i), window_local(j), window_local(k));
+      tile[at] = active(slot) ? T(nodes(slot)[local].value) : T(0);
+      any = any || tile[at] != T(0);
+    }
+    if (!__syncthreads_or(any)) return;  // no point gets more than it has
+    const HomeList<T>& homes = s.homes();
+    const int64_t first = homes.start[home];
+    const int64_t count = min(int64_t(homes.count[home]), s.count - first);
+    for (int64_t r = threadIdx.x; first >= 0 && r < count; r += kDamageThreads) {
+      const int64_t p = first + r;
+      T offset[3];
+      const uint32_t meta = load_place(s, p, offset);
+      if (s.law[s.row_of(meta)] != kPhaseField) continue;
+      const Stencil<T> st = stencil_at(offset);
+      const int base = window_base(meta);
+      T found(0);
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) {
+          const T* f = tile + base + i * kStrideX + j * kStrideY;
+          found +=
+              st.w[0][i] * st.w[1][j] * (st.w[2][0] * f[0] + st.w[2][1] * f[1] + st.w[2][2] * f[2]);
+        }
+      const T peak = s.peak[p], now = peak_after(peak, found);
+      if (now != peak) s.peak[p] = now;
+    }
+  }
+};
+
+template <typename T>
+__global__ void __launch_bounds__(kDamageThreads, kDamageCtas)
+    damage_kernel(const __grid_constant__ SolverView<T> s) {
+  // The same for all CTAs: nobody writes these before all have come to the first wait.
+  if (!may_step(*s.clock) || s.damage_counts[kHotCount] == 0) return;
+  __shared__ unsigned long long sums[kDamageSums][kTile];
+  __shared__ T field[kTile];
+  const cooperative_groups::grid_group all = cooperative_groups::this_grid();
+  const Solve<T> solve{s, damage_stamp(s.clock->step),
+                       int64_t(blockIdx.x) * kDamageThreads + threadIdx.x,
+                       int64_t(gridDim.x) * kDamageThreads};
+  solve.spread();
+  all.sync();
+  solve.list();
+  all.sync();
+  const int64_t homes = s.damage_counts[kHomeCount];
+  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) {
+    solve.scatter(s.damage_homes[i], sums);
+    __syncthreads();
+  }
+  all.sync();
+  solve.prepare();
+  for (int half = 0; half < 2 * kSweeps; ++half) {
+    all.sync();
+    solve.relax(half % 2);
+  }
+  all.sync();
+  if (solve.thread == 0) s.damage_counts[kActiveCount] = 0;
+  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) {
+    solve.gather(s.damage_homes[i], field);
+    __syncthreads();
+  }
+}
+
+}  // namespace
+
+template <typename T>
+void solver_damage_marks(const SolverView<T>& s, cudaStream_t stream) {
+  const unsigned slots =
+      static_cast<unsigned>((s.slot_capacity + kSolverThreads - 1) / kSolverThreads);
+  unmark_kernel<T><<<slots, kSolverThreads, 0, stream>>>(s);
+  mark_kernel<T><<<static_cast<unsigned>(s.home_capacity), kSolverThreads, 0, stream>>>(s);
+}
+
+template <typename T>
+void solver_damage(const SolverView<T>& s, cudaStream_t stream) {
+  int device = 0, processors = 1;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device);
+  const unsigned homes = static_cast<unsigned>(s.home_capacity);
+  cudaLaunchAttribute together{};
+  together.id = cudaLaunchAttributeCooperative;
+  together.val.cooperative = 1;
+  cudaLaunchConfig_t config{};
+  config.gridDim = dim3(min(homes, static_cast<unsigned>(kDamageCtas * processors)));
+  config.blockDim = dim3(kDamageThreads);
+  config.stream = stream;
+  config.attrs = &together;
+  config.numAttrs = 1;
+  cudaLaunchKernelEx(&config, damage_kernel<T>, s);  // solver_step asks for errors
+  launch_g2p<T, kDamageField, false>(s, stream);
+}
+
+#define GSF_INSTANTIATE(T)                                                  \
+  template void solver_damage_marks<T>(const SolverView<T>&, cudaStream_t); \
+  template void solver_damage<T>(const SolverView<T>&, cudaStream_t);
+GSF_INSTANTIATE(float)
+GSF_INSTANTIATE(double)
+#undef GSF_INSTANTIATE
+
+}  // namespace gsf::cuda
