@@ -15,10 +15,12 @@ import torch
 from torch import Tensor
 
 from gsfluent import geometry, ops
-from gsfluent.data import INTERIOR, SPRAY, Gaussians
+from gsfluent.data import INTERIOR, SPRAY, SURFACE, Gaussians
 from gsfluent.pipeline.light.occlusion import COARSEST, FULL, PER_CELL, Occupancy, box_frame
 from gsfluent.pipeline.light.shadow_maps import bulk
 
+# Opacity from which a splat of a skin is matter.
+_FAINT = 0.3
 # Nodes along a side of the grid: room around the matter, and the most.
 _ROOM = 16
 _MOST_NODES = 256
@@ -66,13 +68,16 @@ class Grid(NamedTuple):
     def of(self, gaussians: Gaussians, center: tuple[float, float, float]) -> Occupancy:
         """Occupancy of Gaussians around ``center`` [m]; those off the grid are left out.
 
-        Spray is, too: a cloud of drops is no wall, however many there are.
+        Spray is, too: a cloud of drops is no wall, however many there are. Nor is the haze of faint
+        splats that photographs leave around a skin, and into which a division makes its splats: it
+        counted as matter, and whatever is seen through it was in black shadow.
         """
         means = gaussians.means
         frame = means.new_tensor(box_frame(center, self.cell, self.nodes))
         if gaussians.labels is not None:
             off = frame[:3] - 2.0 * self.cell
-            means = torch.where((gaussians.labels == SPRAY)[:, None], off, means)
+            faint = (gaussians.labels == SURFACE) & (gaussians.opacities < _FAINT)
+            means = torch.where((faint | (gaussians.labels == SPRAY))[:, None], off, means)
         values = ops.occupancy(means, frame, self.nodes, full=FULL * self.per_cell)
         return Occupancy(values, frame, self.nodes)
 

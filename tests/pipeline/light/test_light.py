@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 
 from gsfluent import materials
 from gsfluent.config import Shot
-from gsfluent.data import SPRAY, Camera, Gaussians
+from gsfluent.data import SPRAY, SURFACE, Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.lab.truth import light as truth
 from gsfluent.pipeline.light import environment
@@ -33,6 +33,7 @@ from gsfluent.pipeline.light.from_shot import (
 )
 from gsfluent.pipeline.light.glass import as_seen, see_through
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
+from gsfluent.pipeline.light.normals import grid_for
 from gsfluent.pipeline.light.shade import irradiance, to_linear
 from gsfluent.pipeline.light.shadow import FADE, NORMAL_OFFSET, ShadowMaps, transmittance
 from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
@@ -138,6 +139,17 @@ def test_grains_of_a_spray_shade_nothing(skin: Gaussians) -> None:
     shading = shadow_maps(Gaussians.cat([skin, grains.labelled(0)]), lamps, faces, 128, matter)
     assert alone is not None and both is not None and shading is not None
     assert torch.equal(both.alpha, alone.alpha) and not torch.equal(shading.alpha, alone.alpha)
+
+
+def test_haze_before_a_skin_is_no_matter(skin: Gaussians) -> None:
+    # a skin that is divided, or one from photographs: many splats, each of which hides little
+    haze = skin.replace(means=1.2 * skin.means, opacities=torch.full_like(skin.opacities, 0.1))
+    grid, center = grid_for(skin, radius=0.2), (0.0, 0.0, 0.0)
+    alone = grid.of(skin.labelled(SURFACE), center).values
+    faint = grid.of(Gaussians.cat([skin, haze]).labelled(SURFACE), center).values
+    solid = haze.replace(opacities=torch.full_like(haze.opacities, 0.9))
+    dense = grid.of(Gaussians.cat([skin, solid]).labelled(SURFACE), center).values
+    assert torch.equal(faint, alone) and not torch.equal(dense, alone)
 
 
 def test_lamp_inside_the_matter_gets_a_cube(skin: Gaussians) -> None:
