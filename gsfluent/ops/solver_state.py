@@ -456,6 +456,8 @@ def _unique_rows(values: Tensor) -> tuple[Tensor, Tensor]:
     """
     key = torch.zeros(values.shape[0], dtype=torch.int64, device=values.device)
     for column in values.unbind(1):
+        if bool((column == column[0]).all()):
+            continue
         found, index = torch.unique(column, return_inverse=True)
         key = key * found.shape[0] + index
     kinds, row = torch.unique(key, return_inverse=True)

@@ -45,13 +45,18 @@ GSF_HOST_DEVICE int near_block(int local, int o, int& there) {
 template <typename T, typename Number>
 GSF_HOST_DEVICE uint32_t node_group(const SolverView<T>& s, int fields, const bool* heavy,
                                     const Number& number, int a) {
-  uint32_t group = 1u << a, before = 0;
-  while (s.parent != nullptr && group != before) {
-    before = group;
-    for (int f = 0; f < fields; ++f)
+  uint32_t group = 1u << a;
+  if (s.parent == nullptr) return group;
+  for (uint32_t next = group; next != 0;) {  // whom those found last know
+    const uint32_t last = next;
+    next = 0;
+    for (int f = 0; f < fields; ++f) {
+      if ((last >> f & 1u) == 0) continue;
       for (int g = 0; g < fields; ++g)
-        if (heavy[g] && (before >> f & 1u) != 0 && s.moves_with(number(f), number(g)))
-          group |= 1u << g;
+        if (heavy[g] && ((group | next) >> g & 1u) == 0 && s.moves_with(number(f), number(g)))
+          next |= 1u << g;
+    }
+    group |= next;
   }
   return group;
 }

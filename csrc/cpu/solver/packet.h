@@ -223,12 +223,25 @@ struct PacketMomentum {
 
   // The same for the first moment of the mass about each node, in cells (core/mpm/contact.h).
   void scatter_moment(int first, int end, Lanes<T>* node) const {
-    for (int n = 0; n < 27; ++n) {
-      Lanes<T> sum{};
-      for (int lane = first; lane < end; ++lane) sum += weight[n][lane] * moment[lane];
-      const int i = n / 9, j = n / 3 % 3, k = n % 3;
-      node[(i * kWindowEdge + j) * kWindowEdge + k] +=
-          sum - sum[3] * Lanes<T>{T(i), T(j), T(k), T(0)};
+    for (int i = 0; i < 3; ++i, node += kWindowEdge * kWindowEdge) {
+      const Pack<T>* w = weight + 9 * i;
+      Raw sum[9] = {};
+      int lane = first;
+      if constexpr (sizeof(T) == 4) {
+        for (; lane + 1 < end; lane += 2) {
+          const Raw two = load_pack(reinterpret_cast<const T*>(moment + lane)).v;
+          for (int n = 0; n < 9; ++n) sum[n] += two_lanes(w[n], lane) * two;
+        }
+      }
+      for (; lane < end; ++lane) {
+        const Raw one = one_lane(moment[lane]);
+        for (int n = 0; n < 9; ++n) sum[n] += Pack<T>(w[n][lane]).v * one;
+      }
+      for (int n = 0; n < 9; ++n) {
+        const Lanes<T> all = both_lanes(sum[n]);
+        node[n / 3 * kWindowEdge + n % 3] +=
+            all - all[3] * Lanes<T>{T(i), T(n / 3), T(n % 3), T(0)};
+      }
     }
   }
 

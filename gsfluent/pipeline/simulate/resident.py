@@ -224,6 +224,8 @@ class Resident:
         self._unit, self.cut = field.to(torch.int32), at_rows(state.cut, rows)
         self._faces = self.colliders[:0]
         """Rows of the faces of blades at work, after those of the colliders."""
+        self._wave: float | None = None
+        """Speed of the fastest wave when a face first pushed [m/s]."""
         self._look(position.to(p.dtype))
         self._begin(Points(
             position, p.velocity, p.affine, p.strain, p.alpha, peak, p.deformation, p.viscous
@@ -319,14 +321,14 @@ class Resident:
             driven = max(driven, float(faces[:, VELOCITY].norm(dim=1).max()))
         if driven == 0.0:
             return 1.0
-        matter, solver = self._matter, self._solver
-        wave = ops.wave_speed(
-            solver.strain,
-            law=matter.law,
-            params=matter.params,
-            material=self._constants["material"],
-        )
-        speed, fastest = float(solver.velocity.norm(dim=1).max()), float(wave.max())
+        # Between the looks at a blade, a cell apart, waves change little, and the ratio less.
+        if self._wave is None or not faces.shape[0]:
+            matter, strain = self._matter, self._solver.strain
+            wave = ops.wave_speed(
+                strain, law=matter.law, params=matter.params, material=self._constants["material"]
+            )
+            self._wave = float(wave.max())
+        fastest, speed = self._wave, float(self._solver.velocity.norm(dim=1).max())
         return (fastest + speed) / (fastest + max(speed, driven)) if fastest + speed > 0 else 1.0
 
     def _go(self, stop: float, steps: int) -> None:

@@ -203,10 +203,11 @@ class Run:
                 self.links, self.matter.rest, p.body.long(), self._spacing, p.mass, self._flowing,
                 self._breakable, self._dust,
             )  # fmt: skip
-        if not self.scene.blades:
-            return self._whole
-        may_break = self._breakable | cut_bodies(self.matter, state.cut)
-        return dataclasses.replace(self._whole, may_break=may_break)
+        if self.scene.blades:
+            may_break = self._breakable | cut_bodies(self.matter, state.cut)
+            if not torch.equal(may_break, self._whole.may_break):  # else it keeps what it has found
+                self._whole = dataclasses.replace(self._whole, may_break=may_break)
+        return self._whole
 
     def _look(self, state: State) -> Pieces:
         """The pieces of a state; those of the last one asked for are kept."""
