@@ -129,6 +129,7 @@ class Fit(Verb):
       gsfluent fit shot.yaml --clouds frames/ --learn melon.young_modulus melon.poisson_ratio -o out
       gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
       gsfluent fit shot.yaml --masks films/ --cameras capture/ --learn melon.young_modulus -o out
+      gsfluent fit shot.yaml --points track.npz --laws elastic,von_mises,fluid -o out
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
     What the motion does not show is called unidentified and given as a bound. A fit that was
@@ -139,8 +140,10 @@ class Fit(Verb):
     """The shot file."""
     out: Out
     """Folder for the results; made when missing."""
-    learn: tuple[str, ...]
-    """What, each as OBJECT.NUMBER; velocity and angular_velocity are three."""
+    learn: tuple[str, ...] = ()
+    """What: OBJECT.NUMBER or OBJECT/PART.NUMBER; velocity and angular_velocity are three."""
+    laws: str | None = None
+    """Laws to try for every object and part, with their numbers: elastic,von_mises,fluid."""
     points: Path | None = None
     """Tracked points [T, K, 3] in the scene's metres: a file or folder as of `gsfluent carry`."""
     clouds: Path | None = None
@@ -178,6 +181,7 @@ class Fit(Verb):
         with self.reporter() as report:
             return fit_to(
                 shot, self.out, self.learn, device=self.torch_device(), reporter=report,
+                laws=[law.strip() for law in (self.laws or "").split(",") if law.strip()],
                 **self.given("points", "clouds", "force", "masks", "cameras", "sigma", "fps"),
                 **self.given("starts", "cells", "grids", "jobs", "on", "seed"),
             )  # fmt: skip
@@ -185,6 +189,10 @@ class Fit(Verb):
     def text(self, result: dict[str, Any]) -> str | None:
         """Every number with its band, or why there is none."""
         lines = []
+        for place, facts in result.get("laws", {}).items():
+            also = f", and as well by {', '.join(facts['alike'])}" if facts["alike"] else ""
+            error = facts["tried"][facts["taken"]]["held_out"]
+            lines.append(f"{place}: {facts['taken']} (foretells to {error:.2g} sd{also})")
         for key, number in result["parameters"].items():
             bound = result["unidentified"].get(key)
             said = f"unidentified: {bound}" if bound else f"{number['value']} (sd {number['sd']})"

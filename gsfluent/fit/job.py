@@ -22,7 +22,10 @@ from gsfluent.figure.page import Page
 from gsfluent.figure.series import Panel, curves
 from gsfluent.fit.read import read_masks, read_target
 from gsfluent.io import atomic_path, write_json
+from gsfluent.materials.laws import HANDBOOK, PARAMETERS
+from gsfluent.materials.material import Material
 from gsfluent.pipeline.fit import Fit, Found, Task, run_task
+from gsfluent.pipeline.fit.laws import plain
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
@@ -36,8 +39,9 @@ FILES = {"fit": "fit.json", "shot": "fitted.yaml", "report": "fit.html"}
 def fit_to(
     shot: Shot,
     out: Path,
-    learn: Sequence[str],
+    learn: Sequence[str] = (),
     *,
+    laws: Sequence[str] = (),
     points: Path | None = None,
     clouds: Path | None = None,
     force: Path | None = None,
@@ -59,7 +63,8 @@ def fit_to(
     Args:
         shot: Where the search starts, and what is believed.
         out: Folder for the results.
-        learn: ``OBJECT.NUMBER`` each.
+        learn: ``OBJECT.NUMBER`` or ``OBJECT/PART.NUMBER`` each.
+        laws: Tried for every object and part, see :class:`gsfluent.pipeline.Fit`.
         points: Tracks (see :func:`gsfluent.fit.read.read_target`); or
         clouds: a cloud per frame; or
         force: a table of displacement and force; or
@@ -106,9 +111,11 @@ def fit_to(
         frame = body_frame(scene.bodies[0], scene)
         target = read_masks(path, cameras, frame, sigma=sigma, fps=fps)
         digests.append(content_digest(cameras))
-    base = fingerprint(shot.resolved(), list(learn), kind, *digests, sigma, fps, seed)
+    base = fingerprint(shot.resolved(), list(learn), list(laws), kind, *digests, sigma, fps, seed)
     runner = functools.partial(_through_sweep, out / "search", base, jobs, on)
-    stage = Fit(list(learn), starts=starts, cells=cells, grids=grids, seed=seed, runner=runner)
+    stage = Fit(
+        list(learn), laws=laws, starts=starts, cells=cells, grids=grids, seed=seed, runner=runner
+    )
     found = stage(scene, target, progress=reporter.task("fit"))
     values = {"target": kind, **found.report, "outputs": dict(FILES)}
     write_json(out / FILES["fit"], values)
@@ -133,7 +140,9 @@ def _through_sweep(
 ) -> list[dict[str, Any]]:
     """Do searches, each once; those of another shot or target have other names."""
     tasks = list(items)
-    ids = [fingerprint(base, t.start, t.dx, list(t.shares), t.grids) for t in tasks]
+    ids = [
+        fingerprint(base, t.start, t.dx, list(t.shares), t.grids, t.judge, t.name) for t in tasks
+    ]
     unlike = dict(zip(ids, tasks, strict=True))
     outcomes = sweep_map(
         search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True
@@ -145,16 +154,32 @@ def _through_sweep(
 def fitted(shot: Shot, found: Found) -> dict[str, Any]:
     """The shot with what was learnt; what was not identified stays as it was."""
     values = copy.deepcopy(shot.resolved())
+    entries = values["objects"]
+    made = {body.name: body for body in found.scene.bodies}
+    for place in {**found.laws, **{key.partition(".")[0]: "" for key in found.values}}:
+        name, _, part = place.partition("/")
+        if part and not entries[name].get("parts"):  # the preset's own
+            entries[name]["parts"] = [
+                {"name": p.name, "where": dict(p.where), **p.overrides} for p in made[name].parts
+            ]
+    if found.laws:
+        for name, body in made.items():
+            _relay(entries[name], body.material)
+            for part, entry in zip(body.parts, entries[name].get("parts", []), strict=False):
+                _relay(entry, part.material(body.material))
     thrown: dict[str, dict[str, Any]] = {}
     for key, value in found.values.items():
-        name, _, field = key.partition(".")
-        if name not in values["objects"] or key in found.unidentified:
+        place, _, field = key.partition(".")
+        name, _, part = place.partition("/")
+        if name not in entries or key in found.unidentified:
             continue
         if field in ("velocity", "angular_velocity"):
             event = thrown.setdefault(name, {"type": "throw", "object": name})
             event["velocity" if field == "velocity" else "spin"] = value
+        elif part:
+            next(p for p in entries[name]["parts"] if p.get("name") == part)[field] = value
         else:
-            values["objects"][name][field] = value
+            entries[name][field] = value
     for body in found.scene.bodies:
         if body.name in thrown:  # the event says both
             thrown[body.name].setdefault("velocity", list(body.velocity))
@@ -162,6 +187,15 @@ def fitted(shot: Shot, found: Found) -> dict[str, Any]:
     kept = [e for e in values["events"] if e["type"] != "throw" or e.get("at") or not thrown]
     values["events"] = [*kept, *thrown.values()]
     return values
+
+
+def _relay(entry: dict[str, Any], material: Material) -> None:
+    """Give an object or a part of a shot another law, and drop what that law does not read."""
+    for field in (*PARAMETERS, *HANDBOOK):
+        if field not in material.reads:
+            entry.pop(field, None)
+    entry.pop("softening", None)
+    entry |= {k: v for k, v in plain(material).items() if isinstance(v, int | float | str)}
 
 
 def page(out: Path, values: Mapping[str, Any], times: Sequence[float]) -> Page:
@@ -173,6 +207,14 @@ def page(out: Path, values: Mapping[str, Any], times: Sequence[float]) -> Page:
         shown = f"unidentified: {bound}" if bound else _shown(number["value"])
         share = f"{number['prior_share']:.0%}"
         rows.append([key, shown, _shown(number["sd"]), _shown(number["grid"]), share])
+    for place, facts in values.get("laws", {}).items():
+        tried = sorted(facts["tried"].items(), key=lambda item: item[1]["held_out"])
+        rows_of = [
+            [law, _shown(f["held_out"]), _shown(f["seen"]), _mark(law, facts)] for law, f in tried
+        ]
+        made.heading(f"Law of {place}").table(
+            ["law", "error on frames not seen, sd", "on frames seen, sd", ""], rows_of
+        )
     made.heading("Found")
     made.table(["number", "value", "sd", "of the grid", "prior's share"], rows)
     for heading, items in (
@@ -187,6 +229,10 @@ def page(out: Path, values: Mapping[str, Any], times: Sequence[float]) -> Page:
         drawn = curves(list(times), "t [s]", [Panel("root mean square residual", "sd", series)])
         made.heading("Residual by frame").svg(drawn)
     return made
+
+
+def _mark(law: str, facts: Mapping[str, Any]) -> str:
+    return "taken" if law == facts["taken"] else "as good" if law in facts["alike"] else ""
 
 
 def _shown(value: Any) -> str:

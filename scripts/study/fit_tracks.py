@@ -15,6 +15,7 @@ import dataclasses
 import json
 import math
 import time as clock
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -27,7 +28,7 @@ from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit, Simulate
-from gsfluent.pipeline.fit.stage import RATIO
+from gsfluent.pipeline.fit.task import RATIO
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 
@@ -103,6 +104,8 @@ PUBLISHED = {
     ("sand", "friction_angle"): (6.79, 0.90),
 }  # fmt: skip
 """GIC (Cai et al. 2024) and ProJo4D (TMLR 2026), both from 3 views, as ProJo4D's page has them."""
+PLAIN = ("poisson_ratio", "friction_angle")
+"""Numbers that are no logarithms."""
 SURE = 1.2816
 """Standard deviations on either side that hold 80 % of a normal."""
 
@@ -131,24 +134,30 @@ def scene_of(kind: Kind, solid: Solid, values: dict[str, float], velocity: Any) 
     return scene
 
 
+def seen(
+    kind: Kind, number: int, cells: int, random: np.random.Generator
+) -> tuple[Solid, np.ndarray, dict[str, float], np.ndarray, int]:
+    """A thing, its velocity and numbers, tracks of its fall, how many points moved."""
+    solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
+    velocity = np.array([*random.uniform(-0.3, 0.3, 2), random.uniform(-1.5, -0.5)])
+    drawn = {name: random.uniform(*ends) for name, ends in kind.truth.items()}
+    true = {name: v if name in PLAIN else 10**v for name, v in drawn.items()}
+    dx = SIDE / (cells * RATIO * 2.0)
+    run = Simulate(dx=dx, seed=100 + number, repair=False)(
+        scene_of(kind, solid, true, velocity), fps=FPS, seconds=FRAMES / FPS
+    )
+    frames = [frame.particles.position.double().numpy() for frame in run]
+    rows = random.choice(len(frames[0]), TRACKS, replace=False)
+    return solid, velocity, true, np.stack([frame[rows] for frame in frames]), len(frames[0])
+
+
 def record(kind: str, number: int, cells: int) -> dict[str, Any]:
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
     here = KINDS[kind]
     random = np.random.default_rng([number, len(kind)])
-    solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
-    velocity = np.array([*random.uniform(-0.3, 0.3, 2), random.uniform(-1.5, -0.5)])
-    plain = ("poisson_ratio", "friction_angle")
-    drawn = {name: random.uniform(*ends) for name, ends in here.truth.items()}
-    true = {name: v if name in plain else 10**v for name, v in drawn.items()}
-    dx = SIDE / (cells * RATIO * 2.0)
     begun = clock.process_time()
-    run = Simulate(dx=dx, seed=100 + number, repair=False)(
-        scene_of(here, solid, true, velocity), fps=FPS, seconds=FRAMES / FPS
-    )
-    frames = [frame.particles.position.double().numpy() for frame in run]
-    rows = random.choice(len(frames[0]), TRACKS, replace=False)
-    tracks = np.stack([frame[rows] for frame in frames])
+    solid, velocity, true, tracks, points = seen(here, number, cells, random)
     middle = clock.process_time()
     guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))
     learn = [f"it.{name}" for name in (*true, "velocity")]
@@ -161,7 +170,7 @@ def record(kind: str, number: int, cells: int) -> dict[str, Any]:
             continue
         for k, value in enumerate(np.ravel(learnt["value"])):
             want = velocity[k] if name == "velocity" else true[name]
-            log = name not in ("velocity", *plain)
+            log = name not in ("velocity", *PLAIN)
             error = math.log10(value / want) if log else float(value - want)
             errors.append({"name": name, "error": error, "sd": float(np.ravel(learnt["sd"])[k]),
                            "sd_noise": learnt["sd_noise"][k],
@@ -169,7 +178,7 @@ def record(kind: str, number: int, cells: int) -> dict[str, Any]:
                            "truth": float(want)})  # fmt: skip
     return {
         "kind": kind, "scene": number, "cells": cells, "rows": errors,
-        "rms_mm": found.report["rms"] * 2**0.5, "truth_points": len(frames[0]),
+        "rms_mm": found.report["rms"] * 2**0.5, "truth_points": points,
         "grid": {k: found.values[k] for k in ("floor.offset", "grid.extrapolation")},
         "runs": [g["runs"] for g in found.report["grids"]],
         "points": [g["points"] for g in found.report["grids"]],
@@ -212,6 +221,35 @@ def table(records: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def read(path: Path) -> list[dict[str, Any]]:
+    """What has been done."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [json.loads(line) for line in lines]
+
+
+def in_pool(
+    function: Callable[..., dict[str, Any]],
+    tasks: list[tuple[Any, ...]],
+    path: Path,
+    jobs: int,
+    minutes: float,
+) -> list[dict[str, Any]]:
+    """Call a function with each of the tasks, and add what comes to a file, until time is up."""
+    end, records = clock.monotonic() + 60.0 * minutes, []
+    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+        calls = [pool.submit(function, *task) for task in tasks]
+        try:
+            for call in as_completed(calls, timeout=max(end - clock.monotonic(), 0.0)):
+                records.append(call.result())
+                with path.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(records[-1]) + "\n")
+        except TimeoutError:
+            for process in pool._processes.values():
+                process.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+    return records
+
+
 def main() -> None:
     """Do what is left, then enter the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -226,22 +264,11 @@ def main() -> None:
     parser.add_argument("--markdown", type=Path, default=PAGE)
     options = parser.parse_args()
     path: Path = options.out
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    records = [json.loads(line) for line in lines]
+    records = read(path)
     done = {(r["kind"], r["scene"]) for r in records}
     wanted = [(k, n) for n in range(options.scenes) for k in options.only if (k, n) not in done]
-    end = clock.monotonic() + 60.0 * options.minutes
-    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
-        tasks = {pool.submit(record, kind, number, options.cells) for kind, number in wanted}
-        try:
-            for task in as_completed(tasks, timeout=max(end - clock.monotonic(), 0.0)):
-                records.append(task.result())
-                with path.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(records[-1]) + "\n")
-        except TimeoutError:
-            for process in pool._processes.values():
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
+    tasks = [(kind, number, options.cells) for kind, number in wanted]
+    records += in_pool(record, tasks, path, options.jobs, options.minutes)
     if records:
         page: Path = options.markdown
         text = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"

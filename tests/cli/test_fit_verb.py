@@ -80,6 +80,27 @@ def test_tracks_become_a_shot_that_runs_on(
     assert sorted(done) == sorted((out / "search").rglob("*"))
 
 
+def test_a_law_is_found_for_a_shot_of_another(
+    thrown: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shot believes in clay: rubber foretells what is seen, and the fitted shot has it."""
+    out = thrown / "laws"
+    words = yaml.safe_load((thrown / "shot.yaml").read_text())
+    words["objects"]["it"] = {"material": "rubber", "law": "von_mises", "young_modulus": 5e4,
+                              "poisson_ratio": 0.3, "yield_stress": 2e3}  # fmt: skip
+    (thrown / "clay.yaml").write_text(yaml.safe_dump(words))
+    command = ["fit", str(thrown / "clay.yaml"), "--points", str(thrown / "track.npz")]
+    command += ["--laws", "elastic, fluid", "--starts", "1", "--grids", "1", "--cells", "5"]
+    assert main([*command, "--jobs", "1", "-o", str(out), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["laws"]["it"]["taken"] == "elastic"
+    assert set(found["laws"]["it"]["tried"]) == {"elastic", "fluid"}
+    assert "Law of it" in (out / "fit.html").read_text()
+    fitted = load_shot(out / "fitted.yaml").objects["it"].overrides
+    assert fitted["law"] == "elastic" and "yield_stress" not in fitted
+    assert abs(np.log10(fitted["young_modulus"] / 1.2e5)) < 0.1
+
+
 @pytest.fixture(scope="module")
 def films(thrown: Path) -> tuple[Path, Path]:
     """Masks of the thing, thrown faster, from two cameras in the frame of the splats."""

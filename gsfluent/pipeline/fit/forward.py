@@ -201,14 +201,15 @@ class Forward:
         """Materials of all layers with these numbers; parts keep their own."""
         found: list[Material] = []
         for entry in self._bodies:
-            body = entry["body"]
-            changes = {
-                name: values[f"{body.name}.{name}"]
-                for name in body.material.reads
-                if f"{body.name}.{name}" in values
-            }
-            first = dataclasses.replace(body.material, **changes) if changes else body.material
-            found += [first, *entry["layers"][1:]]
+            name = entry["body"].name
+            labels = [name, *(f"{name}/{part.name}" for part in entry["body"].parts)]
+            for label, layer in zip(labels, entry["layers"], strict=True):
+                changes = {
+                    field: values[f"{label}.{field}"]
+                    for field in layer.reads
+                    if f"{label}.{field}" in values
+                }
+                found.append(dataclasses.replace(layer, **changes) if changes else layer)
         return found
 
     def start(self, values: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor]:

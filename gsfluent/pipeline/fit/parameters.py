@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsfluent.errors import InputError
 from gsfluent.materials.laws import RANGES, READS
-from gsfluent.materials.material import nearest
-from gsfluent.scene.scene import Body, Scene
+from gsfluent.materials.material import Material, nearest
+from gsfluent.scene.scene import Scene
 
 Array = NDArray[np.float64]
 VECTORS = ("velocity", "angular_velocity")
@@ -37,7 +37,7 @@ class Parameter:
     """One number or vector that is learnt.
 
     Attributes:
-        key: ``OBJECT.NAME``.
+        key: ``OBJECT.NAME``, or ``OBJECT/PART.NAME``.
         start: Where the search begins, in its unit; of a vector the three numbers.
         low, high: Bounds from which starts are drawn, or None.
         spread: Standard deviation of the prior, in the free coordinate.
@@ -170,33 +170,57 @@ class Unknowns:
         return found
 
 
+def places(scene: Scene) -> dict[str, Material]:
+    """What has a material of its own: objects by name, and their parts as ``OBJECT/PART``."""
+    found = {}
+    for body in scene.bodies:
+        found[body.name] = body.material
+        for part in body.parts:
+            found[f"{body.name}/{part.name}"] = part.material(body.material)
+    return found
+
+
+def flat(learn: Mapping[str, Mapping[str, Any]] | Sequence[str]) -> dict[str, Any]:
+    """Bounds by ``OBJECT.NUMBER``.
+
+    Raises:
+        InputError: Not of either form.
+    """
+    if not isinstance(learn, Mapping):
+        return dict.fromkeys(learn, True)
+    wanted: dict[str, Any] = {}
+    for name, values in learn.items():
+        if not isinstance(values, Mapping):
+            raise InputError(f"learn.{name} is {values!r}", "give {young_modulus: true, ...}")
+        wanted |= {f"{name}.{key}": bounds for key, bounds in values.items()}
+    return wanted
+
+
 def read_learn(scene: Scene, learn: Mapping[str, Mapping[str, Any]] | Sequence[str]) -> Unknowns:
     """What is to be learnt.
 
     Args:
         scene: Has the objects, and where the search starts.
         learn: ``{"melon": {"young_modulus": (1e4, 1e7), "velocity": True}}``, or
-            ``["melon.young_modulus", "melon.velocity"]``.
+            ``["melon.young_modulus", "melon/rind.young_modulus", "melon.velocity"]``.
 
     Raises:
         InputError: An unknown object, a number that its law does not read or that cannot be learnt
             from motion, bounds that are none, or nothing at all.
     """
-    wanted: dict[str, Any] = {}
-    if isinstance(learn, Mapping):
-        for name, values in learn.items():
-            if not isinstance(values, Mapping):
-                raise InputError(f"learn.{name} is {values!r}", "give {young_modulus: true, ...}")
-            wanted |= {f"{name}.{key}": bounds for key, bounds in values.items()}
-    else:
-        wanted = dict.fromkeys(learn, True)
+    wanted = flat(learn)
+    made = places(scene)
     bodies = {body.name: body for body in scene.bodies}
     found = []
     for key, bounds in wanted.items():
         name, _, field = str(key).partition(".")
-        if name not in bodies:
-            raise InputError(f"learn: no object {name!r}", nearest(name, bodies))
-        found.append(_parameter(bodies[name], field, bounds))
+        if name not in made:
+            raise InputError(f"learn: no object {name!r}", nearest(name, made))
+        if field in VECTORS and name in bodies:
+            motion = tuple(float(v) for v in getattr(bodies[name], field))
+            found.append(Parameter(f"{name}.{field}", motion, spread=_SPREAD[field]))
+            continue
+        found.append(_parameter(name, made[name], field, bounds))
     if not found:
         raise InputError("learn: nothing is to be learnt", "name melon.young_modulus and others")
     if sum(p.size for p in found) > 12:
@@ -207,11 +231,8 @@ def read_learn(scene: Scene, learn: Mapping[str, Mapping[str, Any]] | Sequence[s
     return Unknowns(found)
 
 
-def _parameter(body: Body, field: str, bounds: Any) -> Parameter:
-    where, law = f"learn: {body.name}.{field}", body.material.law
-    if field in VECTORS:
-        motion = tuple(float(v) for v in getattr(body, field))
-        return Parameter(f"{body.name}.{field}", motion, spread=_SPREAD[field])
+def _parameter(place: str, material: Material, field: str, bounds: Any) -> Parameter:
+    where, law = f"learn: {place}.{field}", material.law
     known = [f for f in READS[law] if f not in _FIXED or f == "poisson_ratio"]
     if law in ("nacc", "rigid") or field not in known:
         hint = nearest(field, [*known, *VECTORS])
@@ -220,7 +241,7 @@ def _parameter(body: Body, field: str, bounds: Any) -> Parameter:
         elif field == "density":
             hint = "motion shows stiffness over density: give the density, learn the stiffness"
         raise InputError(f"{where}: cannot be learnt under law {law}", hint)
-    value = getattr(body.material, field)
+    value = getattr(material, field)
     if not isinstance(value, int | float):
         raise InputError(f"{where}: is a field", "give one number to start from")
     low = high = None
@@ -240,6 +261,6 @@ def _parameter(body: Body, field: str, bounds: Any) -> Parameter:
         start = 1.0  # Pa or Pa s: a logarithm has no 0
     spread = WIDE
     if low is not None and high is not None:
-        made = Parameter(f"{body.name}.{field}", (start,))
+        made = Parameter(f"{place}.{field}", (start,))
         spread = max(float(made.free([high])[0] - made.free([low])[0]) / 2.0, 1e-3)
-    return Parameter(f"{body.name}.{field}", (start,), low, high, spread)
+    return Parameter(f"{place}.{field}", (start,), low, high, spread)

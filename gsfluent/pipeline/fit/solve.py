@@ -111,7 +111,7 @@ class Problem:
         """See at these coordinates what a finer grid changes, and how far it is to be trusted."""
         values = self.fixed | self.unknowns.values(free)
         self.change = None
-        coarse = _run(self, free, frames)[1]
+        coarse = run_at(self, free, frames)[1]
         values.pop(FINER, None)
         fine = _steady(lambda dt: finer.run(values, frames, dt), finer.step(values))[1]
         follow = Followers("fit", self.forward.rest, finer.setting())
@@ -185,7 +185,7 @@ def search(
     free, damping, runs = start.copy(), DAMPING[0], problem.forward.runs
     scale = 1.0
     for round_ in range(rounds + 1):
-        dt, motion = _run(problem, free, frames)
+        dt, motion = run_at(problem, free, frames)
         pairs = problem.observer.pair(motion)
         residual, frame = problem.seen(motion, frames, pairs)
         if len(residual) == 0:
@@ -246,7 +246,7 @@ def search(
     )
 
 
-def _run(problem: Problem, free: Array, frames: int) -> tuple[float, Motion]:
+def run_at(problem: Problem, free: Array, frames: int) -> tuple[float, Motion]:
     """Run the middle of a linearisation, at a step that all runs about it can take."""
     return _steady(lambda dt: problem.motion(free, frames, dt, keep=True), problem.dt(free))
 
@@ -326,6 +326,7 @@ def in_stages(
     *,
     finer: Forward | None = None,
     shares: tuple[float, ...] = SHARES,
+    settle: bool = True,
     tell: Tell | None = None,
 ) -> Fitted:
     """Velocities on the frames before contact, then all numbers on more and more frames.
@@ -339,6 +340,7 @@ def in_stages(
         start: Free coordinates.
         finer: The same scene on a finer grid.
         shares: Of the frames, by stage.
+        settle: Search the last stage to its end.
         tell: Told of each linearisation.
     """
     frames, free = len(problem.forward.times), start
@@ -348,8 +350,9 @@ def in_stages(
         free = search(problem, free, before, active=moving, rounds=6, tell=tell).free
     runs = problem.forward.runs
     found = None
-    for count in sorted({max(2, round(share * frames)) for share in shares}):
-        last = count == frames
+    counts = sorted({max(2, round(share * frames)) for share in shares})
+    for count in counts:
+        last = settle and count == counts[-1]
         for _ in range(CORRECTIONS if last and finer else 1):
             if finer is not None:
                 problem.refine(finer, free, count)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.fit.forward import Forward, TooFast
-from gsfluent.pipeline.fit.parameters import FINER, LIMITS, OFFSET, Parameter, Unknowns, read_learn
-from gsfluent.pipeline.fit.solve import SHARES, Problem, in_stages
+from gsfluent.pipeline.fit.laws import choose_laws, known_laws
+from gsfluent.pipeline.fit.parameters import FINER, LIMITS, OFFSET, Parameter, Unknowns
+from gsfluent.pipeline.fit.solve import SHARES
+from gsfluent.pipeline.fit.task import Runner, Task, one_by_one, run_task, unknowns_of
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -21,16 +22,7 @@ from gsfluent.scene.scene import Scene
 from gsfluent.targets.target import Target
 
 Array = NDArray[np.float64]
-Runner = Callable[[Callable[[Any], Any], Iterable[Any]], list[Any]]
-"""Calls a function for every item; :func:`gsfluent.sweep.map` does it in many processes."""
 
-RATIO = 2.0
-"""Ratio of the two grids' spacings."""
-EXTRAPOLATION = (1.5, 0.3)
-"""Believed share of the change to the finer grid that is to come in all, and its deviation: 2 where
-the error falls as dx, 4 / 3 where it falls as its square."""
-OFFSET_PRIOR = (0.4, 0.3)
-"""Believed floor offset in cells, and its deviation: measured on rebounds, docs/theory/fit.md."""
 LEFT = 0.1
 """Of what the finer grid moves a number by, the part that may be left: a standard deviation."""
 NUISANCE = (OFFSET, FINER)
@@ -51,6 +43,7 @@ class Found:
         unidentified: Key -> words; these values are bounds or beliefs, not findings.
         scene: The scene with what was learnt.
         report: All of it as plain values, for ``fit.json``.
+        laws: The law taken for each object and part, where laws were tried.
     """
 
     values: dict[str, Any]
@@ -59,42 +52,7 @@ class Found:
     unidentified: dict[str, str]
     scene: Scene
     report: dict[str, Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Task:
-    """One search: picklable, so that a pool of processes may do it."""
-
-    scene: Scene
-    target: Target
-    unknowns: Unknowns
-    start: list[float]
-    dx: float
-    shares: tuple[float, ...]
-    grids: int = 1
-
-
-def run_task(task: Task) -> dict[str, Any]:
-    """Do one search; plain values come back."""
-    times = list(task.target.times)
-    forward = Forward(task.scene, times, task.dx)
-    finer = Forward(task.scene, times, task.dx / RATIO) if task.grids == 2 else None
-    observer = task.target.observe(forward.setting())
-    problem = Problem(forward, observer, task.unknowns, task.target.step)
-    try:
-        found = in_stages(problem, np.asarray(task.start), finer=finer, shares=task.shares)
-    except TooFast:
-        return {"cost": float("inf"), "free": list(task.start), "runs": forward.runs}
-    used = [g for g in (forward, finer) if g is not None]
-    return {
-        **{k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(found).items()},
-        "grids": [{"dx": g.dx, "points": g.count, "runs": g.runs} for g in used],
-    }
-
-
-def one_by_one(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
-    """Call a function for every item, here."""
-    return [function(item) for item in items]
+    laws: dict[str, str] = dataclasses.field(default_factory=dict)
 
 
 class Fit(Stage):
@@ -105,7 +63,9 @@ class Fit(Stage):
 
     Args:
         learn: What: ``{"melon": {"young_modulus": (1e4, 1e7), "velocity": True}}``, or a list of
-            ``melon.young_modulus``.
+            ``melon.young_modulus``; of a part ``melon/rind.young_modulus``.
+        laws: Tried for every object and part; what foretells frames that no search has seen is
+            taken, with its numbers (:mod:`gsfluent.pipeline.fit.laws`).
         starts: How many; the first is the scene as it is.
         cells: Cells along the longest side of the largest body.
         grids: 2 to see on a grid twice as fine what the first does wrong, and take it out; or 1.
@@ -114,15 +74,16 @@ class Fit(Stage):
         runner: Does the searches; one after the other when absent.
 
     Raises:
-        InputError: A number out of range.
+        InputError: A number out of range, or an unknown law.
     """
 
     name = "fit"
 
     def __init__(
         self,
-        learn: Mapping[str, Mapping[str, Any]] | Sequence[str],
+        learn: Mapping[str, Mapping[str, Any]] | Sequence[str] = (),
         *,
+        laws: Sequence[str] = (),
         starts: int = 4,
         cells: int = 8,
         grids: int = 2,
@@ -137,6 +98,7 @@ class Fit(Stage):
             if not low <= value <= high:
                 raise InputError(f"fit: {name} is {value}", f"give a number from {low} to {high}")
         self.learn, self.starts, self.cells, self.grids = learn, starts, cells, grids
+        self.laws = known_laws(laws)
         self.offset, self.runner = offset, runner
 
     def forward(self, scene: Scene, target: Target, *, progress: Progress | None = None) -> Found:
@@ -151,14 +113,19 @@ class Fit(Stage):
             InputError: What is to be learnt cannot be, or the target does not meet the scene.
             RunError: No start can be run.
         """
-        unknowns = read_learn(scene, self.learn)
-        more = []
-        if self.offset and scene.floor is not None and not scene.colliders:
-            more.append(Parameter(OFFSET, (OFFSET_PRIOR[0],), spread=OFFSET_PRIOR[1]))
-        if self.grids == 2:
-            more.append(Parameter(FINER, (EXTRAPOLATION[0],), spread=EXTRAPOLATION[1]))
-        unknowns = Unknowns([*unknowns.parameters, *more])
         dx = grid_spacing(scene, self.cells)
+        of_grid = {"grids": self.grids, "offset": self.offset}
+        if self.laws:
+            chosen = choose_laws(
+                scene, target, self.learn, self.laws, starts=self.starts, seed=self.seed, dx=dx,
+                runner=self.runner, progress=progress, **of_grid,
+            )  # fmt: skip
+            task = Task(chosen.scene, target, chosen.unknowns, chosen.start, dx, SHARES, self.grids)
+            made = conclude(chosen.scene, chosen.unknowns, self._last([task]), [])
+            return dataclasses.replace(
+                made, laws=chosen.laws, report={**made.report, "laws": chosen.report}
+            )
+        unknowns = unknowns_of(scene, self.learn, **of_grid)
         make = functools.partial(Task, scene, target, unknowns)
         total = 1 + (self.starts if self.starts > 1 else 0)
         begin, tries = unknowns.start.tolist(), list[dict[str, Any]]()
@@ -173,11 +140,16 @@ class Fit(Stage):
             if not good:
                 raise RunError("fit: no start can be run", "nothing", "start from other numbers")
             begin = min(good, key=lambda t: t["cost"])["free"]
-        found = self.runner(run_task, [make(begin, dx, SHARES, self.grids)])[0]
+        found = self._last([make(begin, dx, SHARES, self.grids)])
         report_progress(progress, total, total, f"{self.cells} cells")
+        return conclude(scene, unknowns, found, tries)
+
+    def _last(self, tasks: list[Task]) -> dict[str, Any]:
+        """The search that counts."""
+        found: dict[str, Any] = self.runner(run_task, tasks)[0]
         if not np.isfinite(found["cost"]):
             raise RunError("fit: the best start cannot be run", "nothing", "use fewer cells")
-        return conclude(scene, unknowns, found, tries)
+        return found
 
 
 def of_the_grid(unknowns: Unknowns, free: Array, information: Any) -> Array:
@@ -283,19 +255,27 @@ def least_informed(information: Any, labels: Sequence[str], unknowns: Unknowns) 
 
 
 def with_values(scene: Scene, values: Mapping[str, Any]) -> Scene:
-    """A scene with other numbers of its bodies."""
+    """A scene with other numbers of its bodies and parts."""
     made = Scene.__new__(Scene)
     made.__dict__.update(scene.__dict__)
     made.bodies = []
     for body in scene.bodies:
-        mine = {
-            key.partition(".")[2]: value
-            for key, value in values.items()
-            if key.partition(".")[0] == body.name
-        }
+        mine = _of(values, body.name)
         motion: dict[str, Any] = {
             k: tuple(mine.pop(k)) for k in ("velocity", "angular_velocity") if k in mine
         }
         material = dataclasses.replace(body.material, **mine) if mine else body.material
-        made.bodies.append(dataclasses.replace(body, material=material, **motion))
+        parts = tuple(
+            dataclasses.replace(part, overrides={**part.overrides, **of_part})
+            if (of_part := _of(values, f"{body.name}/{part.name}"))
+            else part
+            for part in body.parts
+        )
+        made.bodies.append(dataclasses.replace(body, material=material, parts=parts, **motion))
     return made
+
+
+def _of(values: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """What is said of an object or of a part."""
+    split = ((key.partition("."), value) for key, value in values.items())
+    return {field: value for (name, _, field), value in split if name == place}
