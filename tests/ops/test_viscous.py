@@ -314,7 +314,10 @@ DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
 
 
 def relaxing_cube(law: int, dtype: torch.dtype, device: str) -> tuple[dict[str, Tensor], Tensor]:
-    """The cube with its branches: a third does not relax, a sixth lets go, half yields late."""
+    """The cube with its branches: a third does not relax, a sixth lets go, half yields late.
+
+    Of brittle matter two fifths have no strength.
+    """
     cube = ball(dtype, law)
     n = cube["position"].shape[0]
     start = branch(0.7, 100.0, n).to(dtype)
@@ -322,7 +325,9 @@ def relaxing_cube(law: int, dtype: torch.dtype, device: str) -> tuple[dict[str, 
     start[::2, 8] = 2e-3
     start[n // 2 : 2 * n // 3, 7] = -5.0  # what springs back lets go
     if law == NACC:
-        cube["alpha"] = torch.where(torch.arange(n) % 3 == 0, -0.05, -0.002).to(dtype)
+        strong, weak, gone = torch.tensor([-0.05, -0.002, 0.02], dtype=dtype)
+        turn = torch.arange(n) % 5
+        cube["alpha"] = torch.where(turn < 2, gone, torch.where(turn < 4, weak, strong))
     return {name: value.to(device) for name, value in cube.items()}, start.to(device)
 
 

@@ -219,15 +219,8 @@ GSF_HOST_DEVICE_COLD NaccState<T> nacc_plastic(const NaccMaterial<T>& m, const N
   NaccReturn<T> ret = nacc_project(m, o, y, p, q);
   const T step = alpha_step(m, trial, ret);
   out.alpha = clamp(alpha + step, T(kAlphaMin), T(kAlphaMax));
-#ifndef __CUDA_ARCH__
   // Without strength the surface is the same whatever alpha: solve_alpha would find this step too.
-  if (alpha >= T(0) && out.alpha >= T(0)) {
-    out.d = ret.r * s.d;
-    out.j2m1 = T(-2) * ret.p / m.kappa;
-    return out;
-  }
-#endif
-  if (o.implicit_alpha) {
+  if (o.implicit_alpha && !(alpha >= T(0) && out.alpha >= T(0))) {
     out.alpha = clamp(solve_alpha(m, o, trial, alpha, step), T(kAlphaMin), T(kAlphaMax));
     ret = nacc_project(m, o, yield_surface(m, out.alpha), p, q);
   }

@@ -40,6 +40,10 @@ typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<
          (alpha <= P(kAlphaMax)) & (b2 > P(1e-16) * flat);
 }
 
+// As far beyond the surface nacc_plastic begins to yield.
+template <typename T>
+inline constexpr double kYieldSlack = sizeof(T) == 4 ? 1e-6 : 2e-15;
+
 // finish_particle for every active lane.
 template <typename T, int kLaws, bool kTrack, bool kKeeps, typename Count>
 void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t reach,
@@ -120,7 +124,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     }
   }
   [[maybe_unused]] Int brittle{};
-  [[maybe_unused]] P holding(0), state(0);  // cohesion and alpha of what is brittle
+  [[maybe_unused]] P holding(0);  // cohesion of what is brittle
   if constexpr (kLaws != kElasticOnly) {
     Int nacc{}, elastic = phase;
     if (packet.same_rows()) {
@@ -138,32 +142,31 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       if (s.irreversible) cohesion *= P(1) - clamp(peak * P(1.0 / kWeakening), P(0), P(1));
       const Int holds = surely_elastic(row, cohesion, alpha, j2m1, n2);
       whole &= ~nacc | (peak < P(0));
-      if constexpr (!with_springs(kLaws)) {
-        softens = plain & nacc & ~holds & (alpha >= P(0)) & (alpha <= P(kAlphaMax)) &
-                  (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin));
-        if (s.options.k == T(2) && mask_bits(softens) != 0) {
-          const NaccMaterial<P> m{row[0], row[1], row[2], cohesion, row[4], row[5]};
-          const Softened<P> now = softened_return(m, P(s.options.epsilon), d, sqrt(n2), j2m1);
-          const P slack(sizeof(T) == 4 ? 1e-6 : 2e-15);
-          softens &= (now.outside > slack) & (alpha + now.step >= P(0)) &
-                     (now.n2 <= P(kSoftenedShear * kSoftenedShear));
-          mix(softens, e, now.strain);
-          mix(softens, d, now.d);
-          j2m1 = select<T>(softens, now.j2m1, j2m1);
-          isochoric = select<T>(softens, now.isochoric, isochoric);
-          n2 = select<T>(softens, now.n2, n2);
-          alpha_after = min(alpha + now.step, P(kAlphaMax));
-          peak_after = max(peak, alpha_after);
-          whole &= ~softens;
-        } else {
-          softens = Int{};
-        }
+      softens = plain & nacc & ~holds & (alpha >= P(0)) & (alpha <= P(kAlphaMax)) &
+                (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin));
+      if constexpr (with_springs(kLaws))  // a yield that takes time is for the full map
+        softens &= packet.load1(s.viscous, kViscousColumns, kViscousColumns - 1) <= P(0);
+      alpha_after = alpha;
+      if (s.options.k == T(2) && mask_bits(softens) != 0) {
+        const NaccMaterial<P> m{row[0], row[1], row[2], cohesion, row[4], row[5]};
+        const Softened<P> now = softened_return(m, P(s.options.epsilon), d, sqrt(n2), j2m1);
+        softens &= (now.outside > P(kYieldSlack<T>)) & (alpha + now.step >= P(0)) &
+                   (now.n2 <= P(kSoftenedShear * kSoftenedShear));
+        mix(softens, e, now.strain);
+        mix(softens, d, now.d);
+        j2m1 = select<T>(softens, now.j2m1, j2m1);
+        isochoric = select<T>(softens, now.isochoric, isochoric);
+        n2 = select<T>(softens, now.n2, n2);
+        alpha_after = select<T>(softens, min(alpha + now.step, P(kAlphaMax)), alpha);
+        peak_after = max(peak, alpha_after);
+        whole &= ~softens;
+      } else {
+        softens = Int{};
       }
       plain &= ~nacc | softens | (holds & (alpha <= peak));
       loss = select<T>(nacc, row[7], loss);
       brittle = nacc;
       holding = cohesion;
-      state = alpha;
     }
   }
 
@@ -191,12 +194,26 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
                                            row[1] + P(4.0 / 3.0) * row[0], P(dt)),
                          P(1)) *
                spring;
-    const P change = det_minus_one(spring);
-    const Sym3<P> away = reciprocal_cube_root(P(1) + change) * deviator(spring);
-    plain &= ~relaxes |
-             ((max_abs(spring) <= P(kStrainMax)) & (change >= P(kJMin * kJMin - 1.0)) &
-              (change <= P(kJMax * kJMax - 1.0)) & (norm2(away) <= P(kDeviatorMax * kDeviatorMax)));
-    plain &= ~(relaxes & brittle) | surely_elastic(row, holding, state, change, norm2(away));
+    P change = det_minus_one(spring);
+    Sym3<P> away = reciprocal_cube_root(P(1) + change) * deviator(spring);
+    const P away2 = norm2(away);
+    plain &=
+        ~relaxes | ((max_abs(spring) <= P(kStrainMax)) & (change >= P(kJMin * kJMin - 1.0)) &
+                    (change <= P(kJMax * kJMax - 1.0)) & (away2 <= P(kDeviatorMax * kDeviatorMax)));
+    Int held = ~(relaxes & brittle) | surely_elastic(row, holding, alpha_after, change, away2);
+    // yield_spring, of what has no strength
+    Int slips = plain & ~held & (alpha_after >= P(0)) & (abs(change) <= P(kSoftenedVolume)) &
+                (row[2] >= P(kFrictionMin));
+    if (s.options.k == T(2) && mask_bits(slips) != 0) {
+      const NaccMaterial<P> m{row[0], row[1], row[2], holding, row[4], row[5]};
+      const Softened<P> now = softened_return(m, P(s.options.epsilon), away, sqrt(away2), change);
+      slips &= (now.outside > P(kYieldSlack<T>)) & (now.n2 <= P(kSoftenedShear * kSoftenedShear));
+      mix(slips, spring, now.strain);
+      mix(slips, away, now.d);
+      change = select<T>(slips, now.j2m1, change);
+      held |= slips;
+    }
+    plain &= held;
     stress = shared_stress(stress, add_diagonal(row[0] * away, P(0.5) * row[1] * change),
                            select<T>(relaxes, four[6], P(0)));
   }
@@ -251,7 +268,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const int lane = __builtin_ctz(left);
       s.meta[packet.index[lane]] = static_cast<uint32_t>(moved[lane]);
     }
-    if constexpr (kLaws != kElasticOnly && !with_springs(kLaws)) {
+    if constexpr (kLaws != kElasticOnly) {
       const uint32_t yielding = done & mask_bits(softens);
       counts.plastic += __builtin_popcount(yielding);
       for (uint32_t left = yielding; left != 0; left &= left - 1) {
