@@ -74,6 +74,16 @@ def test_a_fall_is_measured_once_and_entered(tmp_path: Path, capsys: pytest.Capt
     assert "| 8 |" in study.seeds_table([row])
 
 
+def test_the_account_of_a_fall_adds_up() -> None:
+    account = load_script("study/fracture_account")
+    row = account.study(account.MELON, 8, 0)
+    parts = [row[name] for name in ("relaxed", "torn", "pressed", "yielded")]
+    assert min(parts) > -1e-3 * row["dissipated"]
+    assert 0.75 * row["dissipated"] < sum(parts) < row["dissipated"]
+    assert row["relaxed"] == max(parts) and row["torn"] > 0.0
+    assert account.page_table([row]).count("\n") == 2
+
+
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
     scene = study.thrown("glass", 3e-4, 1e-4, 8)
     assert len(scene.materials) <= 16 and scene.v[0, 2] < 0.0
