@@ -104,6 +104,9 @@ class Scene(Events):
                 "scene.add: the solid holds no matter", hint="fill it first (gsfluent fill)"
             )
         chosen = materials.get(material) if isinstance(material, str) else material
+        if temperature is not None and chosen.hysteresis == "unloading":
+            # what melts has no springs yet: the loss that needs no memory
+            chosen = chosen.override(hysteresis="pressed")
         regions = tuple(Part.parse(part) for part in (chosen.parts if parts is None else parts))
         for part in regions:
             part.material(

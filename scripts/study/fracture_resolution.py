@@ -142,6 +142,10 @@ class Trial:
 
 
 MELON = Trial("fruit.watermelon", (0.125, 0.125, 0.115), 0.2, height=0.75)
+DROPS = {  # cracked, but whole; and in pieces
+    "watermelon": MELON,
+    "watermelon, 3 m": dataclasses.replace(MELON, height=3.0),
+}
 BALLS = {  # a ball of bread does not break, from wherever it falls: it is torn below
     "glass": Trial("glass", (0.03, 0.03, 0.03), 0.01, height=4.0),
 }
@@ -298,8 +302,9 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     if unknown := set(only) - set(PARTS):
         raise SystemExit(f"--only: unknown {', '.join(sorted(unknown))}; {', '.join(PARTS)}")
     if "drop" in only:
-        for cells in args.cells:
-            trial("drop", "watermelon", MELON, cells)
+        for name, one in DROPS.items():
+            for cells in args.cells:
+                trial("drop", name, one, cells)
     if "balls" in only:
         for name, one in BALLS.items():
             for cells in args.ball_cells:
@@ -307,7 +312,7 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     if "seeds" in only:  # seed 0 is that of part "drop"
         for cells in args.seed_cells:
             for seed in range("drop" in only and cells in args.cells, args.seeds):
-                trial("drop", "watermelon", MELON, cells, seed)
+                trial("drop", "watermelon, 3 m", DROPS["watermelon, 3 m"], cells, seed)
     if "loose" in only:
         for name, one in LOOSE.items():
             for cells in args.ball_cells if name == "bread torn" else args.loose_cells:
@@ -521,13 +526,15 @@ def page(lines: Path, device: str) -> int:
         entered["runs"] = table(_HEAD, [line(r) for r in runs])
     if falls := [r for r in runs if r["part"] != "loose" or r["name"] == "bread torn"]:
         entered["exponents"] = exponents(falls)
-    if any(r["seed"] for r in of("drop")):
-        entered["seeds"] = seeds_table(of("drop"))
+    parted = [r for r in of("drop") if any(o["name"] == r["name"] and o["seed"] for o in rows)]
+    if parted:
+        entered["seeds"] = seeds_table(parted)
     if bench := of("bench"):
         entered["bench"] = bench_table(bench)
         draw(bench)
     for name, part in entered.items():
-        text = enter(text, f"fracture resolution {name}", part)
+        where = name if device == "cuda" else f"{name} {device}"
+        text = enter(text, f"fracture resolution {where}", part)
     with atomic_path(PAGE) as file:
         file.write_text(text, encoding="utf-8")
     return 0

@@ -1,10 +1,10 @@
-"""How fruit that lands whole rebounds, on grids from 12 to 32 cells, against the literature.
+"""How a body that lands whole rebounds, on grids from 12 to 32 cells, against the literature.
 
-python scripts/study/restitution.py                   # five minutes of one core; resumable
+python scripts/study/restitution.py                   # twenty minutes of one core; resumable
 python scripts/study/restitution.py --only apple --cells 12 16    # some of it
 
 Balls as in ``drop_heights.py``, with the stiffness of the preset and the real one. One JSON line
-per fruit, stiffness and grid; what is there is not run again. What the literature says stands in
+per body, stiffness and grid; what is there is not run again. What the literature says stands in
 ``docs/measured/data/restitution.toml``.
 """
 
@@ -32,7 +32,8 @@ GOOD, SAME = 0.15, 0.1
 
 def study(name: str, given: dict[str, Any], how: str, cells: int, device: str) -> dict[str, Any]:
     """The record of one landing."""
-    case = Case(name, ball(given["diameter_m"]), float(cells), TRAVERSALS, fruit=True)
+    fruit = given["preset"].startswith("fruit.")
+    case = Case(name, ball(given["diameter_m"]), float(cells), TRAVERSALS, fruit=fruit)
     drop = Drop(case, {"preset": given["preset"]}, how, device, False)
     drop.fall([(given["height_m"], 0)], 1e9)
     fall = drop.falls[0]
@@ -46,8 +47,8 @@ def study(name: str, given: dict[str, Any], how: str, cells: int, device: str) -
 
 
 def table(rows: list[dict[str, Any]], literature: dict[str, dict[str, Any]]) -> str:
-    """Markdown: every fruit and stiffness, over the grids."""
-    head = ("fruit", "stiffness", "height m", "literature", *(f"{n} cells" for n in CELLS),
+    """Markdown: every body and stiffness, over the grids."""
+    head = ("body", "stiffness", "height m", "literature", *(f"{n} cells" for n in CELLS),
             "between grids", "farthest off")  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     right = same = count = 0

@@ -60,17 +60,28 @@ def test_a_fall_is_measured_once_and_entered(tmp_path: Path, capsys: pytest.Capt
     words = ["-o", str(lines), "--only", "drop", "--cells", "8"]
     assert study.main([*words, "--estimate"]) == 0 and not lines.exists()
     assert study.main(words) == 0
-    (row,) = study.read(lines)
+    row, higher = study.read(lines)
+    assert higher["dissipated"] > 3.0 * row["dissipated"] and higher["broken"] > row["broken"]
     assert row["cells"] == 8 and row["verdict"] == "clean" and row["largest"] > 0.5
     assert 0.0 < row["dissipated"] < row["at_start"] and row["broken"] > 0.0
     assert row["blocks"] >= 0.9 * row["blocks_intact"] > 0.0
     lines.write_text(lines.read_text() + '{"part": "dr')  # cut off
     capsys.readouterr()
     assert study.main(words) == 0
-    assert "there" in capsys.readouterr().err and len(study.read(lines)) == 1
+    assert "there" in capsys.readouterr().err and len(study.read(lines)) == 2
     cells = study.line(row)
     assert len(cells) == len(study._HEAD) and cells[0] == "watermelon"
     assert "| 8 |" in study.seeds_table([row])
+
+
+def test_the_account_of_a_fall_adds_up() -> None:
+    account = load_script("study/fracture_account")
+    row = account.study(account.MELON, 8, 0)
+    parts = [row[name] for name in ("relaxed", "torn", "pressed", "yielded")]
+    assert min(parts) > -1e-3 * row["dissipated"]
+    assert 0.75 * row["dissipated"] < sum(parts) < row["dissipated"]
+    assert row["relaxed"] == max(parts) and row["torn"] > 0.0
+    assert account.page_table([row]).count("\n") == 2
 
 
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:

@@ -231,6 +231,14 @@ def test_what_cannot_melt_is_refused() -> None:
         Surroundings(speed=-1.0)
 
 
+def test_what_may_melt_has_a_loss_without_springs() -> None:
+    scene = Scene()
+    for temperature in (None, -5.0):
+        scene.add(block((0.02, 0.02, 0.02), 0.0025), "ice", temperature=temperature)
+    assert [b.material.hysteresis for b in scene.bodies] == ["unloading", "pressed"]
+    assert [b.material.viscous for b in scene.bodies] == [True, False]
+
+
 def test_a_live_scene_with_temperatures_takes_nothing_more() -> None:
     from gsfluent.pipeline.simulate.grow import copy_of, grow
 

@@ -1,0 +1,217 @@
+"""Where the energy of a fall goes: torn, pressed, relaxed, or taken between points and nodes.
+
+    python scripts/study/fracture_account.py               # ten minutes of one core; resumable
+    python scripts/study/fracture_account.py --cells 16 --heights 3
+
+The watermelon of ``fracture_resolution.py``, step by step. The law's stress and that of the
+relaxing spring work on the velocity gradient of every point; what of the work is not stored is
+plastic, or relaxed. Plastic work is told apart by the sign of the pressure under which it is done.
+What the ledger of energies lacks beyond that is lost between points and nodes and on the floor.
+One JSON line per fall; the table is entered into the page of the resolution.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from fracture_resolution import LINES, MELON, PAGE, Row, Trial, link_area, numbers, read, table
+from torch import Tensor
+
+from gsfluent import materials, ops
+from gsfluent.figure.markdown import enter
+from gsfluent.io.atomic import atomic_path
+from gsfluent.lab.charts.record import machine
+from gsfluent.ops.plasticity import LAWS
+from gsfluent.pipeline.matter.points import Matter
+from gsfluent.pipeline.matter.state import State
+from gsfluent.pipeline.matter.weld import crushed
+from gsfluent.pipeline.simulate.stage import Simulate
+
+OUT = LINES.with_name("fracture_account.jsonl")
+
+
+class Account:
+    """Works of the stress on every point, and what of them is stored.
+
+    Hand it to a simulation as its ``step_hook``.
+
+    Attributes:
+        torn: Plastic work of each point under tension [J], float64 [N].
+        pressed: The same under pressure.
+        relaxed: What the spring of each point lost [J].
+    """
+
+    def __init__(self) -> None:
+        self.matter: Matter | None = None
+        self._last: State | None = None
+
+    def begin(self, matter: Matter, state: State) -> None:
+        """Take the points that are to be watched."""
+        self.matter = matter
+        none = torch.zeros(matter.particles.count, dtype=torch.float64)
+        self.torn, self.pressed, self.relaxed = none, none.clone(), none.clone()
+        self._elastic = torch.full_like(matter.law, LAWS["elastic"])
+        self._plain = torch.zeros_like(matter.params)
+        self._plain[:, :2] = matter.params[:, :2]
+        self._last = state
+        self._held, self._stress = self._energies(state), self._stresses(state)
+
+    def __call__(self, state: State) -> State:
+        """Add the work of the step just made: stress before it on the gradient after it."""
+        if self._last is None:
+            return state
+        after, dt = state.particles, state.time - self._last.time
+        c = after.affine
+        rate = torch.stack(
+            [
+                c[:, 0, 0], c[:, 1, 1], c[:, 2, 2], c[:, 0, 1] + c[:, 1, 0],
+                c[:, 0, 2] + c[:, 2, 0], c[:, 1, 2] + c[:, 2, 1],
+            ],
+            dim=1,
+        )  # fmt: skip
+        held, stress = self._energies(state), self._stresses(state)
+        volume = dt * after.volume.double()
+        law, spring = ((s * rate).sum(dim=1).double() * volume for s in self._stress)
+        plastic = law - (held[0] - self._held[0])
+        tension = self._stress[0][:, :3].sum(dim=1) > 0.0
+        self.torn += torch.where(tension, plastic, 0.0)
+        self.pressed += torch.where(tension, 0.0, plastic)
+        self.relaxed += spring - (held[1] - self._held[1])
+        self._last, self._held, self._stress = state, held, stress
+        return state
+
+    def _energies(self, state: State) -> tuple[Tensor, Tensor]:
+        """Stored by law and spring of each point [J], float64 [N] each."""
+        assert self.matter is not None
+        p, m = state.particles, self.matter
+        share, spring = self._shares(state)
+        law = ops.elastic_energy(p.strain, law=m.law, params=m.params, material=p.material)
+        held = ops.elastic_energy(
+            spring, law=self._elastic, params=self._plain, material=p.material
+        )
+        volume = p.volume.double()
+        return volume * ((1.0 - share) * law).double(), volume * (share * held).double()
+
+    def _shares(self, state: State) -> tuple[Tensor, Tensor]:
+        """Share of the stiffness that relaxes [N], strain of its spring [N, 6]."""
+        p = state.particles
+        if p.viscous is None:
+            return torch.zeros_like(p.alpha), torch.zeros_like(p.strain)
+        return p.viscous[:, 6], p.viscous[:, :6]
+
+    def _stresses(self, state: State) -> tuple[Tensor, Tensor]:
+        """Stress of law and spring, each with its share [Pa]."""
+        assert self.matter is not None
+        p, m = state.particles, self.matter
+        share, spring = self._shares(state)
+        still = torch.zeros_like(p.affine)
+        law = ops.return_mapping(
+            p.strain, p.alpha, still, law=m.law, params=m.params, material=p.material, dt=1.0
+        )[2]
+        held = ops.return_mapping(
+            spring, torch.zeros_like(p.alpha), still, law=self._elastic, params=self._plain,
+            material=p.material, dt=1.0,
+        )[2]  # fmt: skip
+        return (1.0 - share[:, None]) * law, share[:, None] * held
+
+
+def study(trial: Trial, cells: int, seed: int) -> Row:
+    """A fall and its account."""
+    begun = time.perf_counter()
+    account = Account()
+    sim = Simulate(
+        dx=2.0 * max(trial.half) / cells, seed=seed, repair=False, splats=False, device="cpu",
+        step_hook=account,
+    )  # fmt: skip
+    steps = sim(trial.scene(), fps=100.0, seconds=trial.begins + trial.seconds + 0.011)
+    frame = next(steps)
+    account.begin(steps.run.matter, steps.run.state)
+    for later in steps:
+        frame = later
+    run, report = steps.run, steps.report
+    matter, state = run.matter, run.state
+    ever = state.ever | (state.peak >= 0.0)
+    powder = ever & crushed(matter, state.lowest)
+    volume = matter.particles.volume.double()
+    labels, (a, b) = frame.fragments, run.links.unbind(dim=1)
+    between = (labels[a] != labels[b]) & (labels[a] >= 0) & (labels[b] >= 0)
+    area = int(between.sum()) * link_area(run.links, matter.rest, float(volume.sum()))
+    shares = frame.pieces.mass_fractions
+    return {
+        "height": trial.height, "cells": cells, "seed": seed, "device": "cpu",
+        "machine": machine("cpu"), "dx": matter.dx, "points": matter.particles.count,
+        "dissipated": report["per_frame"]["dissipated"][-1],
+        "torn": float(account.torn[ever].sum()), "pressed": float(account.pressed[ever].sum()),
+        "yielded": float((account.torn + account.pressed)[~ever].sum()),
+        "relaxed": float(account.relaxed.sum()), "broken_volume": float(volume[ever].sum()),
+        "crushed_volume": float(volume[powder].sum()),
+        "area": area, "pieces_over_1_percent": int((shares > 0.01).sum()),
+        "largest": float(shares[0]), "wall": round(time.perf_counter() - begun, 1),
+    }  # fmt: skip
+
+
+def page_table(rows: list[dict[str, Any]]) -> str:
+    """Markdown: every fall."""
+    head = (
+        "from m", "cells", "lost J", "relaxed", "broken matter, torn", "broken matter, pressed",
+        "whole matter", "points and nodes, floor", "broken", "crushed", "pieces over 1 %",
+        "torn / (A G_c)",
+    )  # fmt: skip
+    energy = float(materials.get(MELON.material).fracture_energy or 0.0)
+    out = []
+    for r in sorted(rows, key=lambda r: (r["height"], r["cells"], r["seed"])):
+        parts = [r[k] for k in ("relaxed", "torn", "pressed", "yielded")]
+        parts.append(r["dissipated"] - sum(parts))
+        area = r["broken_volume"] / (2.0 * r["dx"])
+        whole = 4.0 / 3.0 * torch.pi * float(torch.tensor(MELON.half).prod())
+        out.append(
+            [
+                f"{r['height']:g}", str(r["cells"]), f"{r['dissipated']:.1f}",
+                *(f"{100.0 * part / r['dissipated']:.1f} %" for part in parts),
+                *(f"{100.0 * r[k] / whole:.1f} %" for k in ("broken_volume", "crushed_volume")),
+                str(r["pieces_over_1_percent"]),
+                f"{r['torn'] / (area * energy):.2f}" if area else "-",
+            ]
+        )  # fmt: skip
+    return table(head, out)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line and run it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--out", type=Path, default=OUT)
+    parser.add_argument("--cells", type=numbers, default=(12, 16, 20, 24))
+    parser.add_argument("--heights", type=float, nargs="+", default=[0.75, 3.0])
+    parser.add_argument("--seeds", type=int, default=1)
+    args = parser.parse_args(argv)
+    done = {(r["height"], r["cells"], r["seed"]) for r in read(args.out)}
+    for cells in args.cells:
+        for height in args.heights:
+            for seed in range(args.seeds):
+                if (height, cells, seed) in done:
+                    continue
+                row = study(dataclasses.replace(MELON, height=height), cells, seed)
+                sys.stderr.write(f"{json.dumps(row)}\n")
+                with args.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
+    if args.out == OUT:
+        text = enter(
+            PAGE.read_text(encoding="utf-8"), "fracture resolution account",
+            page_table(read(args.out)),
+        )  # fmt: skip
+        with atomic_path(PAGE) as file:
+            file.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
