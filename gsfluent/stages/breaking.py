@@ -19,7 +19,7 @@ _BAND = 2.0  # cells that a crack is wide: so much less of a body is left to cut
 SURE = 1.25
 """Times the speed from which a thing is estimated to break at which it surely does."""
 _SLENDER = 0.15
-"""Share of the ball around it that a slender body fills at most: a bar one by two by four has 0.2."""
+"""Share of the ball around it that a slender body fills at most: a bar of 1 : 2 : 4 has 0.24."""
 _HIGH = 20.0  # m; what needs more is not dropped but shot at
 _STEEL = 7800.0
 
@@ -34,8 +34,10 @@ def breaks_from(
     The sum of both is needed (docs/theory/fracture.md). Scattered strength takes its energy along:
     a body that is larger than the specimens has weaker spots, and breaks there. What is slender
     bends as a whole: its strain is ``sqrt(3) v / c`` (Hunt 1960), wherever it is struck, and all
-    of its energy can go into one cut. Of a material without a fracture energy it is :attr:`gsfluent.materials.Material.breaking_speed`, at which it
-    starts to break.
+    of its energy can go into one cut.
+
+    Of a material without a fracture energy it is
+    :attr:`gsfluent.materials.Material.breaking_speed`, at which it starts to break.
 
     Args:
         material: What the body is made of.

@@ -355,7 +355,7 @@ def hull_grid(
                 break
             continue
         if not seen:
-            counts = [voxels // 2, voxels]
+            counts = [min(count, voxels), voxels]
         occupied = grid[inside]
         margin = 1.5 * (high - low) / (count - 1)
         low, high = occupied.min(axis=0) - margin, occupied.max(axis=0) + margin
