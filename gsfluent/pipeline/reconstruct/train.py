@@ -39,6 +39,7 @@ from gsfluent.pipeline.reconstruct.target import ErrorTarget
 
 _HALVED_FROM = 64  # pixels; smaller photographs are not halved
 _MASK_WEIGHT = 2.0  # weight of the opacity loss; 0.5 leaves a rim of a third of a pixel (measured)
+_NEEDLE = 3.0  # longest over middle axis before it is pulled back
 _SWEEPS = (0.3, 0.5, 0.7, 0.85)  # of an object's run: what hangs before its skin is swept away
 _SWEPT = CleanLimits(depth=0.01)  # closer than cleaning at the end, since the rest can still learn
 _RESTRAIN_EVERY = 10  # steps
@@ -279,12 +280,19 @@ class Trainer:
 
 
 def shape_loss(model: SplatModel) -> Tensor:
-    """Mean scale in units of the extent.
+    """Mean scale in units of the extent, and the excess of needles over an aspect of 3.
 
     GaussianFluent's equation 1 asks for small scales; the mean keeps its weight independent of the
-    count. Needles are no matter of the loss: :func:`clamp_aspect` leaves none.
+    count. Needles are penalised because they swing widely when the matter they ride on turns.
     """
-    return 0.5 * model.scales().mean() / model.extent
+    scales = model.scales()
+    size = 0.5 * scales.mean() / model.extent
+    if model.isotropic:
+        return size
+    longest = scales.amax(1)
+    middle = scales.sum(1) - longest - scales.amin(1)
+    aspect = longest / middle.clamp_min(1e-9)
+    return size + 0.002 * (aspect - _NEEDLE).clamp_min(0.0).mean()
 
 
 def decibels(mean_squared_error: float) -> float:
