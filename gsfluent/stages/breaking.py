@@ -18,24 +18,32 @@ _STRESS, _ENERGY = 1.1, 8.8
 _BAND = 2.0  # cells that a crack is wide: so much less of a body is left to cut
 SURE = 1.25
 """Times the speed from which a thing is estimated to break at which it surely does."""
+_SLENDER = 0.15
+"""Share of the ball around it that a slender body fills at most: a bar of 1 : 2 : 4 has 0.24."""
 _HIGH = 20.0  # m; what needs more is not dropped but shot at
 _STEEL = 7800.0
 
 
-def breaks_from(material: Material, length: float, dx: float | None = None) -> float:
+def breaks_from(
+    material: Material, length: float, dx: float | None = None, *, slender: bool = False
+) -> float:
     """Speed of a landing that parts a body [m/s]; infinite for what does not break.
 
     The landing brings the stress, which by Hertz goes as ``E (v / c)^(6/5)``, and pays for the
     break: its energy ``rho V v^2 / 2`` over that of a cut across the longest side, ``G V / L``.
     The sum of both is needed (docs/theory/fracture.md). Scattered strength takes its energy along:
-    a body that is larger than the specimens has weaker spots, and breaks there. Of a material
-    without a fracture energy it is :attr:`gsfluent.materials.Material.breaking_speed`, at which it
-    starts to break.
+    a body that is larger than the specimens has weaker spots, and breaks there. What is slender
+    bends as a whole: its strain is ``sqrt(3) v / c`` (Hunt 1960), wherever it is struck, and all
+    of its energy can go into one cut.
+
+    Of a material without a fracture energy it is
+    :attr:`gsfluent.materials.Material.breaking_speed`, at which it starts to break.
 
     Args:
         material: What the body is made of.
         length: Longest side of the body [m].
         dx: Node spacing [m]: a coarse grid keeps less strength; the real strength without.
+        slender: It is a plate, a bar or a vessel, and not compact (:func:`is_slender`).
     """
     start = material.breaking_speed
     if material.law == "phase_field" and dx is not None:
@@ -50,7 +58,11 @@ def breaks_from(material: Material, length: float, dx: float | None = None) -> f
     kept = 1.0 if dx is None else kept_strength(material, dx)
     strength = kept * float(material.strengths()[0].min())
     stressed = _STRESS * material.wave_speed * (strength / young) ** (5.0 / 6.0)
-    paid = _ENERGY * math.sqrt(6.0 * energy / (density * length))
+    paid = math.sqrt(6.0 * energy / (density * length))
+    if slender:
+        stressed = kept * start / math.sqrt(3.0)
+    else:
+        paid *= _ENERGY
     if material.weibull_modulus > 0.0:  # the size effect of a ball
         specimens = material.reference_volume / (math.pi / 6.0 * length**3)
         paid *= specimens ** (0.5 / material.weibull_modulus)
@@ -61,6 +73,11 @@ def breaks_from(material: Material, length: float, dx: float | None = None) -> f
 def _length(body: Body) -> float:
     low, high = body.bounds()
     return float((high - low).max())
+
+
+def is_slender(body: Body) -> bool:
+    """Whether a body fills so little of the ball around it that it bends: plates, bars, vessels."""
+    return body.volume < _SLENDER * math.pi / 6.0 * _length(body) ** 3
 
 
 def landing_speed(body: Body, scene: Scene) -> float | None:
@@ -88,7 +105,7 @@ def breaking_rows(body: Body, lands: float | None, pull: float, dx: float) -> li
     """
     rows = []
     for material in body.materials:
-        limit = breaks_from(material, _length(body), dx)
+        limit = breaks_from(material, _length(body), dx, slender=is_slender(body))
         finite = math.isfinite(limit)
         breaks = finite and lands is not None and lands >= limit
         rows.append(
@@ -114,7 +131,7 @@ def _hint(body: Body, limit: float, lands: float, pull: float, dx: float) -> str
             said.append(f"a drop from {height:.2g} m")
         else:
             said.append(f"throw: {SURE * limit:.2g} m/s")
-    if weaker := _weaker(_length(body), lands, dx):
+    if weaker := _weaker(body, lands, dx):
         said.append(f"material: {weaker}")
     if math.isfinite(limit):
         # a bullet that brings the energy of that fall, a tenth as wide as the body
@@ -127,17 +144,17 @@ def _hint(body: Body, limit: float, lands: float, pull: float, dx: float) -> str
 
 
 @functools.lru_cache(maxsize=8)  # a second of work, and the same for every part of a body
-def _presets(length: float, dx: float) -> dict[str, float]:
+def _presets(length: float, dx: float, slender: bool) -> dict[str, float]:
     """From which speed bodies of the presets break that can."""
     return {
-        name: breaks_from(materials.get(name), length, dx)
+        name: breaks_from(materials.get(name), length, dx, slender=slender)
         for name in materials.names()
         if materials.get(name).law == "nacc"
     }
 
 
-def _weaker(length: float, lands: float, dx: float) -> str:
+def _weaker(body: Body, lands: float, dx: float) -> str:
     """The toughest preset that such a landing surely breaks; empty without any."""
-    found = _presets(length, dx) if lands > 0.0 else {}
+    found = _presets(_length(body), dx, is_slender(body)) if lands > 0.0 else {}
     fit = {name: speed for name, speed in found.items() if SURE * speed <= lands}
     return max(fit, key=fit.__getitem__) if fit else ""

@@ -29,6 +29,8 @@ def test_the_drawn_photographs_fit_their_cameras(tmp_path: Path) -> None:
     places = torch.from_numpy(grid[inside])
     extent = float((places.amax(0) - places.amin(0)).max())
     assert 0.24 < extent < 0.29
+    # the four points a side of the first round are all outside, as those around a pane are
+    assert hull_grid(views, capture, look_at_point(capture.cameras), 8)[1].any()
 
 
 def test_steps_points_and_blocks_of_a_measurement_are_counted() -> None:

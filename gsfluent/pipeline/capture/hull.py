@@ -344,19 +344,26 @@ def hull_grid(
 
     Returns:
         Its points [V, V, V, 3], and which of them lie in the hull, bool [V, V, V]; where nothing
-        does the lattice may be coarser.
+        does the lattice may be coarser or finer.
     """
     reach = float(np.median(np.linalg.norm(capture.centers().numpy() - focus, axis=1)))
     low, high = focus - 0.6 * reach, focus + 0.6 * reach
     grid, inside = np.zeros((*(voxels,) * 3, 3)), np.zeros((voxels,) * 3, dtype=bool)
-    # each round fits the grid to what the last left; only the last has to be fine
-    for count in (voxels // 2, voxels // 2, voxels) if len(views) >= 3 else ():
+    # each round fits the grid to what the last left, and only the last has to be fine; the first
+    # is made finer where it finds nothing: a pane lies between the points of a coarse one
+    counts = [voxels // 2, voxels, 2 * voxels] if len(views) >= 3 else []
+    while counts:
+        count = counts.pop(0)
         axes = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         shares = inside_masks(views, torch.from_numpy(grid.reshape(-1, 3)))
-        inside = (shares >= _AGREE).reshape((count,) * 3)
+        seen, inside = inside.any(), (shares >= _AGREE).reshape((count,) * 3)
         if not inside.any():
-            break
+            if seen:
+                break
+            continue
+        if not seen:
+            counts = [min(count, voxels), voxels]
         occupied = grid[inside]
         margin = 1.5 * (high - low) / (count - 1)
         low, high = occupied.min(axis=0) - margin, occupied.max(axis=0) + margin

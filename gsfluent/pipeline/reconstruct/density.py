@@ -36,7 +36,7 @@ _SHARPNESS = 100.0  # of the switch that spares opaque Gaussians from noise
 _MOST_COPIES = 50  # one Gaussian is split among at most so many
 _MCMC_OPACITY = 0.01  # weight of the mean opacity in the loss
 _MCMC_SCALE = 0.01  # weight of the mean scale, in units of the extent
-_ASPECT = 4.0  # longest over middle axis of what is kept: more is a needle
+_ASPECT = 2.0  # longest over middle axis of what is kept: more is a needle
 _OVERHANG = 0.004  # of the object's size: how far a Gaussian may reach beyond the hull
 _LOOSE = 0.01  # the same in training: a tighter hold costs half a decibel inside the masks
 _SEEN = 0.02  # opacity at which a Gaussian ends for the eye
@@ -149,7 +149,7 @@ def contained(gaussians: Gaussians, hull: Hull) -> tuple[Gaussians, int]:
 
 
 def clamp_aspect(model: SplatModel) -> None:
-    """No longest axis over four times the middle one; needles swing and stick out."""
+    """No longest axis over twice the middle one; strokes and needles swing and stick out."""
     if not model.isotropic:
         ops.clamp_aspect(model.parameters["scales"], _ASPECT)
 

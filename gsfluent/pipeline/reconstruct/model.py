@@ -15,7 +15,7 @@ from gsfluent.pipeline.reconstruct.recipe import LearningRates
 
 _BETA1 = 0.9
 _EPSILON = 1e-15
-_NEEDLE = 6.0  # longest over middle axis before it is pulled back
+_NEEDLE = 3.0  # longest over middle axis before it is pulled back
 
 Rows = dict[str, Tensor]
 
@@ -24,7 +24,7 @@ class Pulls(NamedTuple):
     """Weights of penalties in the loss."""
 
     size: float = 0.0  # of the mean scale, in units of the extent
-    needle: float = 0.0  # of the mean excess of longest over middle axis, over 6
+    needle: float = 0.0  # of the mean excess of longest over middle axis, over 3
     opacity: float = 0.0  # of the mean opacity
 
 
