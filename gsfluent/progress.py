@@ -18,8 +18,9 @@ from typing import Protocol
 
 _log = logging.getLogger(__name__)
 
-# A log file is read later by a person: one line every few seconds says as much as a thousand.
-_SECONDS_BETWEEN_LINES = 5.0
+# A log file is read later by a person: one line every few seconds says as much as a thousand. A
+# second less than the longest silence that is promised, for a busy machine wakes nobody in time.
+_SECONDS_BETWEEN_LINES = 4.0
 
 
 class Reporter(Protocol):
@@ -174,10 +175,17 @@ class _Watched:
             more = "" if self.adds is None else self.adds(name, done, total)
             report(done, total, f"{text}, {more}" if text and more else text or more)
             # a log says itself when it has said something; a bar draws at once
-            if not isinstance(self.inner, LineReporter):
+            if _draws(self.inner):
                 self.pulse.last = time.monotonic()
 
         return watched
+
+
+def _draws(reporter: Reporter) -> bool:
+    """Whether bars are drawn at once, behind all who watch."""
+    while isinstance(reporter, _Watched):
+        reporter = reporter.inner
+    return not isinstance(reporter, LineReporter)
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def _execute(command: Verb, as_json: bool) -> int:
 
     try:
         with allow_outside(command.allow_outside):
-            result = command.execute()
+            result = command.heard()
     except KeyboardInterrupt as stop:
         return _fail(as_json, "Interrupted", str(stop) or "interrupted by Ctrl-C", _INTERRUPTED)
     except GsfluentError as error:
