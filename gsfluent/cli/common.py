@@ -39,7 +39,6 @@ class Verb:
 
     serves: ClassVar[bool] = False
     """Whether it waits for people: then silence is no news."""
-    _watched: ClassVar[Callable[[Reporter], Reporter] | None] = None
 
     def execute(self) -> dict[str, Any]:
         """Do the work and return what ``--json`` prints."""
@@ -82,7 +81,8 @@ class Verb:
     def reporter(self) -> Iterator[Reporter]:
         """Progress of several tasks, drawn as this process and ``--json`` allow."""
         with reporter(quiet=self.json) as report:
-            yield report if self._watched is None else self._watched(report)
+            watched: Callable[[Reporter], Reporter] | None = vars(self).get("_watched")
+            yield report if watched is None else watched(report)
 
     @contextmanager
     def progress(self, name: str) -> Iterator[Progress]:

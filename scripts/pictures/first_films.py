@@ -17,7 +17,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
 import torch
 
@@ -39,6 +38,8 @@ def made(source: Path, out: Path) -> dict[str, Any]:
 
 def frames_of(path: Path) -> np.ndarray:
     """All frames of a film, uint8 [T, H, W, 3]."""
+    import imageio_ffmpeg
+
     film = imageio_ffmpeg.read_frames(str(path))
     width, height = next(film)["size"]
     return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in film])
