@@ -53,7 +53,8 @@ def _sample_truth(obj: DemoObject, resolution: int) -> dict[str, Any]:
     return {
         "color": color.view(*cube, 3).cpu().numpy(),
         "parts": parts.view(cube).cpu().numpy().astype(np.uint16),
-        "depth": depth.view(cube).cpu().numpy(), "origin": origin.cpu().numpy(), "voxel": np.float64(voxel),
+        "depth": depth.view(cube).cpu().numpy(), "origin": origin.cpu().numpy(),
+        "voxel": np.float64(voxel),
         "name": np.array(obj.name), "seed": np.int64(obj.seed),
     }  # fmt: skip
 
