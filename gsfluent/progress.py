@@ -20,7 +20,8 @@ _log = logging.getLogger(__name__)
 
 # A log file is read later by a person: one line every few seconds says as much as a thousand. A
 # second less than the longest silence that is promised, for a busy machine wakes nobody in time.
-_SECONDS_BETWEEN_LINES = 4.0
+_LONGEST_SILENCE = 4.0
+_SECONDS_BETWEEN_LINES = 3.0  # of one task, so that progress comes before its silence is broken
 
 
 class Reporter(Protocol):
@@ -192,7 +193,7 @@ def _draws(reporter: Reporter) -> bool:
 def heartbeat(
     name: str,
     says: Callable[[], str],
-    seconds: float = _SECONDS_BETWEEN_LINES,
+    seconds: float = _LONGEST_SILENCE,
     adds: Callable[[str, int, int], str] | None = None,
 ) -> Iterator[Callable[[Reporter], Reporter]]:
     """Say something whenever nothing has been said for a while.
