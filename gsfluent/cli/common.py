@@ -51,7 +51,7 @@ class Verb:
             What it returns.
         """
         if self.serves:
-            return self.execute()
+            return self._inside()
         name, begun = type(self).__name__.lower(), time.monotonic()
 
         def says() -> str:
@@ -59,6 +59,13 @@ class Verb:
 
         with heartbeat("gsfluent", says, _LONGEST) as watched:
             vars(self)["_watched"] = watched  # no option of the command line
+            return self._inside()
+
+    def _inside(self) -> dict[str, Any]:
+        """:meth:`execute`, where captures may name what ``--allow-outside`` lets them."""
+        from gsfluent.io.checked.inside import allow_outside  # loads torch, which takes a while
+
+        with allow_outside(self.allow_outside):
             return self.execute()
 
     def text(self, result: dict[str, Any]) -> str | None:
