@@ -195,6 +195,7 @@ def heartbeat(
     says: Callable[[], str],
     seconds: float = _LONGEST_SILENCE,
     adds: Callable[[str, int, int], str] | None = None,
+    first: float | None = None,
 ) -> Iterator[Callable[[Reporter], Reporter]]:
     """Say something whenever nothing has been said for a while.
 
@@ -203,6 +204,7 @@ def heartbeat(
         says: Makes the line.
         seconds: Longest silence.
         adds: Makes what is added to the progress of a task, from its name, done and total.
+        first: Longest silence at the start; ``seconds`` by default.
 
     Returns:
         Takes a reporter and gives one whose drawing counts as saying something.
@@ -210,7 +212,7 @@ def heartbeat(
     log, pulse, over = logging.getLogger(name), _Pulse(), threading.Event()
 
     def beat() -> None:
-        wait = seconds
+        wait = seconds if first is None else first
         while not over.wait(wait):
             wait = seconds - (time.monotonic() - pulse.last)
             if wait <= 0.05 * seconds:

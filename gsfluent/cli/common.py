@@ -17,6 +17,8 @@ from gsfluent.progress import Progress, Reporter, heartbeat, reporter
 
 _log = logging.getLogger(__name__)
 
+_FIRST = 2.5
+"""The same at the start [s], before which Python and the command line have loaded."""
 _LONGEST = 4.5
 """Silence that a verb breaks [s]; a run, which knows more to say, does so a little before."""
 
@@ -57,7 +59,7 @@ class Verb:
         def says() -> str:
             return f"{name}: at work, {time.monotonic() - begun:.0f} s since the start"
 
-        with heartbeat("gsfluent", says, _LONGEST) as watched:
+        with heartbeat("gsfluent", says, _LONGEST, first=_FIRST) as watched:
             vars(self)["_watched"] = watched  # no option of the command line
             return self._inside()
 
