@@ -1,6 +1,6 @@
 """How long commands say nothing: the longest silence of each, and what was said before it.
 
-    python scripts/stages/silence.py --data /work/shared/data -o out/silence [--write]
+    python scripts/stages/silence.py --data "$GSFLUENT_DATA" -o out/silence [--write]
     python scripts/stages/silence.py -- gsfluent run melon.ply -o out/melon
 
 Every command runs in a process of its own, once into a pipe, where progress is lines, and once on a
