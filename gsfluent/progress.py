@@ -18,8 +18,10 @@ from typing import Protocol
 
 _log = logging.getLogger(__name__)
 
-# A log file is read later by a person: one line every few seconds says as much as a thousand.
-_SECONDS_BETWEEN_LINES = 5.0
+# A log file is read later by a person: one line every few seconds says as much as a thousand. A
+# second less than the longest silence that is promised, for a busy machine wakes nobody in time.
+_LONGEST_SILENCE = 4.0
+_SECONDS_BETWEEN_LINES = 3.0  # of one task, so that progress comes before its silence is broken
 
 
 class Reporter(Protocol):
@@ -174,18 +176,26 @@ class _Watched:
             more = "" if self.adds is None else self.adds(name, done, total)
             report(done, total, f"{text}, {more}" if text and more else text or more)
             # a log says itself when it has said something; a bar draws at once
-            if not isinstance(self.inner, LineReporter):
+            if _draws(self.inner):
                 self.pulse.last = time.monotonic()
 
         return watched
+
+
+def _draws(reporter: Reporter) -> bool:
+    """Whether bars are drawn at once, behind all who watch."""
+    while isinstance(reporter, _Watched):
+        reporter = reporter.inner
+    return not isinstance(reporter, LineReporter)
 
 
 @contextmanager
 def heartbeat(
     name: str,
     says: Callable[[], str],
-    seconds: float = _SECONDS_BETWEEN_LINES,
+    seconds: float = _LONGEST_SILENCE,
     adds: Callable[[str, int, int], str] | None = None,
+    first: float | None = None,
 ) -> Iterator[Callable[[Reporter], Reporter]]:
     """Say something whenever nothing has been said for a while.
 
@@ -194,6 +204,7 @@ def heartbeat(
         says: Makes the line.
         seconds: Longest silence.
         adds: Makes what is added to the progress of a task, from its name, done and total.
+        first: Longest silence at the start; ``seconds`` by default.
 
     Returns:
         Takes a reporter and gives one whose drawing counts as saying something.
@@ -201,11 +212,13 @@ def heartbeat(
     log, pulse, over = logging.getLogger(name), _Pulse(), threading.Event()
 
     def beat() -> None:
-        wait = seconds
+        wait = seconds if first is None else first
         while not over.wait(wait):
             wait = seconds - (time.monotonic() - pulse.last)
             if wait <= 0.05 * seconds:
-                log.info("%s", says())
+                # past the level: small runs whose lines are kept back are what takes long
+                words = log.makeRecord(log.name, logging.INFO, __file__, 0, says(), (), None)
+                log.handle(words)
                 wait = seconds
 
     log.addHandler(pulse)

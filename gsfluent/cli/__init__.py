@@ -75,11 +75,8 @@ def _command(arguments: list[str]) -> int:
 
 def _execute(command: Verb, as_json: bool) -> int:
     """Run a verb and turn whatever happens into words and an exit code."""
-    from gsfluent.io.checked.inside import allow_outside
-
     try:
-        with allow_outside(command.allow_outside):
-            result = command.execute()
+        result = command.heard()
     except KeyboardInterrupt as stop:
         return _fail(as_json, "Interrupted", str(stop) or "interrupted by Ctrl-C", _INTERRUPTED)
     except GsfluentError as error:

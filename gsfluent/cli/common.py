@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
 from gsfluent.errors import InputError
-from gsfluent.progress import Progress, Reporter, reporter
+from gsfluent.progress import Progress, Reporter, heartbeat, reporter
 
 _log = logging.getLogger(__name__)
+
+_FIRST = 2.5
+"""The same at the start [s], before which Python and the command line have loaded."""
+_LONGEST = 4.5
+"""Silence that a verb breaks [s]; a run, which knows more to say, does so a little before."""
 
 Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 On = Annotated[str, tyro.conf.arg(metavar="local|slurm|ray[=HOST:PORT]")]
@@ -33,9 +39,36 @@ class Verb:
     allow_outside: bool = False
     """Let a capture name files outside its folder."""
 
+    serves: ClassVar[bool] = False
+    """Whether it waits for people: then silence is no news."""
+
     def execute(self) -> dict[str, Any]:
         """Do the work and return what ``--json`` prints."""
         raise NotImplementedError
+
+    def heard(self) -> dict[str, Any]:
+        """:meth:`execute`, which is never silent for five seconds.
+
+        Returns:
+            What it returns.
+        """
+        if self.serves:
+            return self._inside()
+        name, begun = type(self).__name__.lower(), time.monotonic()
+
+        def says() -> str:
+            return f"{name}: at work, {time.monotonic() - begun:.0f} s since the start"
+
+        with heartbeat("gsfluent", says, _LONGEST, first=_FIRST) as watched:
+            vars(self)["_watched"] = watched  # no option of the command line
+            return self._inside()
+
+    def _inside(self) -> dict[str, Any]:
+        """:meth:`execute`, where captures may name what ``--allow-outside`` lets them."""
+        from gsfluent.io.checked.inside import allow_outside  # loads torch, which takes a while
+
+        with allow_outside(self.allow_outside):
+            return self.execute()
 
     def text(self, result: dict[str, Any]) -> str | None:
         """What a person reads; None for one line per key of the result."""
@@ -53,9 +86,12 @@ class Verb:
         """Those of its options that are set."""
         return {n: value for n in names if (value := getattr(self, n)) is not None}
 
-    def reporter(self) -> AbstractContextManager[Reporter]:
+    @contextmanager
+    def reporter(self) -> Iterator[Reporter]:
         """Progress of several tasks, drawn as this process and ``--json`` allow."""
-        return reporter(quiet=self.json)
+        with reporter(quiet=self.json) as report:
+            watched: Callable[[Reporter], Reporter] | None = vars(self).get("_watched")
+            yield report if watched is None else watched(report)
 
     @contextmanager
     def progress(self, name: str) -> Iterator[Progress]:

@@ -61,6 +61,7 @@ class Inspect(Verb):
     def execute(self) -> dict[str, Any]:
         """Inspect the input and draw the picture."""
         from gsfluent.inspection.capture import inspect
+        from gsfluent.io import kind_of
 
         existing(self.input, "INPUT")
         suffix = self.input.suffix.lower()
@@ -68,6 +69,11 @@ class Inspect(Verb):
             return self._shot()
         if self.run is not None:
             raise InputError("--run belongs to a shot", "name the shot's .yaml, or leave it out")
+        if kind_of(self.input) == "mesh":
+            raise InputError(
+                f"{self.input}: a mesh, which is not inspected",
+                f"gsfluent plan {self.input} says what a run makes of it",
+            )
         if suffix == ".ply" and (shown := _regions(self.input, self.out)) is not None:
             return shown
         return inspect(self.input, out=self.out, size=self.size, device=self.torch_device())

@@ -139,9 +139,9 @@ class Demo(Verb):
         from gsfluent.run.demo import SIZES, photograph_demo, run_demo
 
         if self.photographs is not None:
-            scale, seed = SIZES[self.size], self.seed
+            scale, seed, device = SIZES[self.size], self.seed, self.torch_device()
             with self.progress("photograph") as progress:
-                return photograph_demo(self.name, self.photographs, scale, seed, progress)
+                return photograph_demo(self.name, self.photographs, scale, seed, progress, device)
 
         device = self.torch_device()
         with self.reporter() as report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -28,6 +28,8 @@ class View(Verb):
 
     OUT may be a run that is still at work: frames appear as they are written.
     """
+
+    serves: ClassVar[bool] = True
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder that `gsfluent run` wrote, or is writing; with --live also a shot or a solid."""
@@ -101,6 +103,7 @@ class Studio(Verb):
     melon.ply go to melon_out, as those of `gsfluent run`. It answers this machine only.
     """
 
+    serves: ClassVar[bool] = True
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER")] = Path(".")
     """Where objects lie and results go."""
     port: int = 8080

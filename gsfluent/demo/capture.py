@@ -6,6 +6,7 @@ reconstruction made from them is tested against something it did not make.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -14,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -66,6 +68,19 @@ def make_object(name: str = "watermelon", seed: int = 0) -> DemoObject:
     return OBJECTS[name](seed)
 
 
+def moved(value: Any, device: torch.device) -> Any:
+    """An object of this room, or a list or tuple of them, with its tensors on a device."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, list | tuple):
+        return type(value)(moved(one, device) for one in value)
+    if isinstance(value, DemoObject | SolidNoise | Table):
+        there = copy.copy(value)
+        vars(there).update({name: moved(one, device) for name, one in vars(value).items()})
+        return there
+    return value
+
+
 def ring_cameras(obj: DemoObject, views: int, *, on_table: bool) -> list[Tensor]:
     """World-to-camera matrices on three rings, one of them below the object unless ``on_table``.
 
@@ -101,7 +116,7 @@ def photograph(
     """One photograph by ray casting with box-filter anti-aliasing.
 
     Args:
-        obj: What is photographed.
+        obj: What is photographed; on the device on which it is drawn (:func:`moved`).
         view: World-to-camera matrix, shape [4, 4].
         size: Width and height [px].
         supersample: Rays per pixel and axis.
@@ -111,6 +126,13 @@ def photograph(
         Image [size, size, 3] sRGB and coverage of the object [size, size], both float32 in [0, 1].
         Without a table the colour is that of the covered part of the pixel (straight alpha).
     """
+    with obj.center.device:
+        return _photograph(obj, view.to(obj.center), size, supersample, table)
+
+
+def _photograph(
+    obj: DemoObject, view: Tensor, size: int, supersample: int, table: Table | None
+) -> tuple[Tensor, Tensor]:
     fine = size * supersample
     focal = 0.5 * fine / math.tan(math.radians(0.5 * _FIELD_OF_VIEW))
     rotation, eye = view[:3, :3], -(view[:3, :3].T @ view[:3, 3])
@@ -118,7 +140,7 @@ def photograph(
     color = torch.zeros(fine, fine, 3)
     cover = torch.zeros(fine, fine)
     turn = rotation.to(torch.float32)
-    rows = max(1, _CHUNK // fine)
+    rows = max(1, _CHUNK // fine) if view.device.type == "cpu" else fine
     for top in range(0, fine, rows):
         y, x = torch.meshgrid(axis[top : top + rows], axis, indexing="ij")
         direction = torch.stack([x, y, torch.ones_like(x)], -1).reshape(-1, 3) @ turn
@@ -198,8 +220,15 @@ def cut_photograph(
     """A straight-on photograph of the object cut through its middle, across ``axis``.
 
     Returns:
-        Image [size, size, 3] and mask [size, size], float32 in [0, 1].
+        Image [size, size, 3] and mask [size, size], float32 in [0, 1], where the object is.
     """
+    with obj.center.device:
+        return _cut_photograph(obj, size, axis, supersample)
+
+
+def _cut_photograph(
+    obj: DemoObject, size: int, axis: int, supersample: int
+) -> tuple[Tensor, Tensor]:
     fine = size * supersample
     others = [k for k in range(3) if k != axis]
     reach = 1.04 * max(obj.axes[k] for k in others) * (1.0 + obj.bump_amplitude)
@@ -244,6 +273,7 @@ def make_capture(
     seed: int = 0,
     support: str = "none",
     masks: bool = True,
+    device: torch.device | str = "cpu",
     progress: Progress | None = None,
 ) -> DemoPaths:
     """Photograph a demo object into a capture folder, with the truth about its inside beside it.
@@ -256,10 +286,11 @@ def make_capture(
         out_dir: Folder to write; made when missing.
         views: Photographs, at least 3.
         size: Width and height [px], 32 to 4096.
-        seed: Draws the object. The same seed writes the same bytes.
+        seed: Draws the object. The same seed writes the same bytes on the same kind of device.
         support: "none" (floating, seen from below too, RGBA images) or "table" (on a wooden table
             in a room, RGB images, sparse points beside them).
         masks: With a table, also write masks to ``masks/``.
+        device: Where they are drawn.
         progress: Called as ``progress(done, total, message)``.
 
     Returns:
@@ -285,8 +316,11 @@ def make_capture(
     if mask_dir is not None:
         mask_dir.mkdir(exist_ok=True)
 
+    there = torch.device(device)
+    drawn, around = moved(obj, there), moved(table, there)
+
     def shoot(number: int) -> None:
-        image, mask = photograph(obj, cameras[number], size, table=table)
+        image, mask = photograph(drawn, cameras[number], size, table=around)
         _write_png(root / "images" / f"{number:03d}.png", image, mask if table is None else None)
         if mask_dir is not None:
             _write_png(mask_dir / f"{number:03d}.png", mask[..., None].expand(-1, -1, 3), None)
@@ -297,9 +331,9 @@ def make_capture(
                 report_progress(progress, done, len(cameras), "photographs")
         # The exemplar is another fruit of the same kind: nobody can cut the photographed one and
         # keep it whole.
-        sibling = OBJECTS[name](seed + 1000).one()
+        sibling = moved(OBJECTS[name](seed + 1000).one(), there)
         _write_png(root / "cut.png", *cut_photograph(sibling, axis=sibling.cut_axis))
-        save_truth(obj, root / "truth.npz")
+        save_truth(drawn, root / "truth.npz")
     for number, view in enumerate(cameras):
         images.append(root / "images" / f"{number:03d}.png")
         frame: dict[str, object] = {
@@ -345,4 +379,6 @@ def _write_png(path: Path, image: Tensor, mask: Tensor | None) -> None:
     value = (
         image if mask is None else torch.cat([image * (mask > 0)[..., None], mask[..., None]], -1)
     )
-    Image.fromarray((value * 255.0).round().to(torch.uint8).numpy()).save(path, compress_level=3)
+    Image.fromarray((value * 255.0).round().to(torch.uint8).cpu().numpy()).save(
+        path, compress_level=3
+    )

@@ -152,10 +152,10 @@ class DemoObject:
                 points[:, 0], math.inf
             )
         reach = 1.6 * float(self.seed_axes.max())
-        _, found = cKDTree(self.seed_center.numpy()).query(
-            local.double().numpy(), distance_upper_bound=reach, workers=-1
+        _, found = cKDTree(self.seed_center.cpu().numpy()).query(
+            local.double().cpu().numpy(), distance_upper_bound=reach, workers=-1
         )
-        nearest = torch.from_numpy(found)
+        nearest = torch.from_numpy(found).to(local.device)
         near = nearest < len(self.seed_center)
         nearest = torch.where(near, nearest, torch.zeros_like(nearest))
         distance = torch.full_like(points[:, 0], math.inf)

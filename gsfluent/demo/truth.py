@@ -31,6 +31,11 @@ def sample_truth(obj: DemoObject, resolution: int = 128) -> dict[str, Any]:
         2 pith, 3 flesh, 4 + k seed k), ``depth`` float32 [R, R, R] metres below the surface
         (0 outside), ``origin`` float64 [3], ``voxel``, ``name``, ``seed``.
     """
+    with obj.center.device:
+        return _sample_truth(obj, resolution)
+
+
+def _sample_truth(obj: DemoObject, resolution: int) -> dict[str, Any]:
     lower, upper = obj.bounds()
     extent = float((upper - lower).max()) * 1.02
     origin = 0.5 * (lower + upper) - 0.5 * extent
@@ -46,8 +51,10 @@ def sample_truth(obj: DemoObject, resolution: int = 128) -> dict[str, Any]:
     depth[inside] = obj.depth(matter).to(torch.float32).clamp_min(0.0)
     cube = (resolution,) * 3
     return {
-        "color": color.view(*cube, 3).numpy(), "parts": parts.view(cube).numpy().astype(np.uint16),
-        "depth": depth.view(cube).numpy(), "origin": origin.numpy(), "voxel": np.float64(voxel),
+        "color": color.view(*cube, 3).cpu().numpy(),
+        "parts": parts.view(cube).cpu().numpy().astype(np.uint16),
+        "depth": depth.view(cube).cpu().numpy(), "origin": origin.cpu().numpy(),
+        "voxel": np.float64(voxel),
         "name": np.array(obj.name), "seed": np.int64(obj.seed),
     }  # fmt: skip
 

@@ -193,7 +193,7 @@ class SolverState:
         local = (cell - 4 * block + 1)[order]
         word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row[order] << 9
         b.id = order.to(torch.int32)
-        rows = {name: value[order].to(self.dtype) for name, value in values.items()}
+        rows = {name: value.index_select(0, order).to(self.dtype) for name, value in values.items()}
         self._store(offset[order], word, rows)
         coord = self._unkey(unique)
         homes, reach = unique.shape[0], self._reach(coord)
@@ -327,8 +327,7 @@ class SolverState:
     def _restored(self, values: Tensor) -> Tensor:
         """Bring stored values into the order of loading."""
         out = torch.empty_like(values, memory_format=torch.contiguous_format)
-        out[self._buffers.id.long()] = values
-        return out
+        return out.index_copy_(0, self._buffers.id.long(), values)
 
     @property
     def position(self) -> Tensor:

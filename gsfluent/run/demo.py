@@ -68,7 +68,12 @@ def demo_shot(name: str, size: DemoSize, capture: Path, exemplar: Path) -> dict[
 
 
 def photograph_demo(
-    name: str, folder: Path, size: DemoSize, seed: int = 0, progress: Progress | None = None
+    name: str,
+    folder: Path,
+    size: DemoSize,
+    seed: int = 0,
+    progress: Progress | None = None,
+    device: torch.device | str = "cpu",
 ) -> dict[str, Any]:
     """Photograph a built-in object: ``photographs/``, ``cut.png`` and ``truth.npz`` in a folder.
 
@@ -82,7 +87,7 @@ def photograph_demo(
     """
     paths = make_capture(
         name, folder / "photographs", views=size.views, size=size.image_size, seed=seed,
-        progress=progress,
+        device=device, progress=progress,
     )  # fmt: skip
     paths.truth.replace(folder / "truth.npz")
     paths.cut.replace(folder / "cut.png")
@@ -137,10 +142,12 @@ def _run(
     store = StageStore(out / "stages", force=force)
 
     def photograph(folder: Path) -> dict[str, Any]:
-        made = photograph_demo(name, folder, scale, seed, reporter.task("photograph"))
+        made = photograph_demo(name, folder, scale, seed, reporter.task("photograph"), device)
         return {"photographs": made["images"]}
 
-    key = fingerprint("photograph", name, scale.views, scale.image_size, seed)
+    kind = torch.device(device).type  # whose roundings the photographs have
+    drawn = () if kind == "cpu" else (kind,)
+    key = fingerprint("photograph", name, scale.views, scale.image_size, seed, *drawn)
     made = store.run("photograph", key, photograph)
     values = demo_shot(name, scale, made.folder / "photographs", made.folder / "cut.png")
     with atomic_path(out / "shot.yaml") as part:

@@ -51,6 +51,7 @@ _FASTEST = 25.0  # m/s at the floor, as a good arm throws: what needs more is sh
 _AFTER = 1.2  # seconds of film after the landing
 _QUICK = 0.06  # s: what lands with its length in less is shown slower, by as much
 _SLOWEST = 8  # times slower than it happens, at most
+_BEFORE = 0.8  # seconds of film before the landing of what is shown slower
 _SAMPLE = 2000  # points of a surface that are asked for their colour
 _VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
 _SOLID = 0.3  # opacity from which a splat counts
@@ -367,18 +368,24 @@ def _fall(
             why = f"is estimated to break from {limit:.2g} m/s, faster than one throws"
         height, why = 1.0, f"a drop from 1 m ({material.name} {why})"
         return [{"type": "drop", "height": height}], _time(height, 0.0, 1.0), why
-    needed = (SURE * limit) ** 2 / (2.0 * _GRAVITY)
-    height = round(min(max(needed, _LOW), _HIGH), 2)
+    lands = SURE * limit
+    needed = lands**2 / (2.0 * _GRAVITY)
+    height, speed = min(max(needed, _LOW), _HIGH), 0.0
+    lands = max(lands, math.sqrt(2.0 * _GRAVITY * height))
+    # what is small and fast has left the picture before anybody has seen it break
+    slow = float(min(max(1, round(_QUICK * lands / size)), _SLOWEST))
+    if needed > _HIGH:
+        falls = _BEFORE / slow  # of what is shown slower nobody waits for the whole fall
+        if slow > 1.0:
+            height = min(max(lands * falls - 0.5 * _GRAVITY * falls**2, _LOW), _HIGH)
+        speed = round(math.sqrt(lands**2 - 2.0 * _GRAVITY * height), 1)
+    height = round(height, 2)
     events: list[dict[str, Any]] = [{"type": "drop", "height": height}]
     about = f"{material.name} is estimated to break from {limit:.2g} m/s"
-    speed, said = 0.0, f"a drop from {height:g} m ({about})"
-    if needed > _HIGH:
-        speed = round(math.sqrt((SURE * limit) ** 2 - 2.0 * _GRAVITY * height), 1)
+    said = f"a drop from {height:g} m ({about})"
+    if speed > 0.0:
         events.append({"type": "throw", "velocity": [0.0, 0.0, -speed]})
         said = f"thrown down from {height:g} m at {speed:g} m/s ({about})"
-    # what is small and fast has left the picture before anybody has seen it break
-    lands = math.hypot(speed, math.sqrt(2.0 * _GRAVITY * height))
-    slow = float(min(max(1, round(_QUICK * lands / size)), _SLOWEST))
     if slow > 1.0:
         said += f", shown {slow:g} times slower than it happens"
     return events, _time(height, speed, slow), said

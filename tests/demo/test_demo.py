@@ -11,7 +11,8 @@ import torch
 
 from gsfluent import demo
 from gsfluent.data import INTERIOR, SURFACE, Gaussians, Solid
-from gsfluent.demo.capture import DemoPaths, one_thread_per_operation
+from gsfluent.demo import capture
+from gsfluent.demo.capture import DemoPaths, moved, one_thread_per_operation
 from gsfluent.demo.truth import grid_points
 from gsfluent.errors import InputError
 from gsfluent.io import load_capture
@@ -187,3 +188,39 @@ def _true_solid(truth: demo.DemoObject, voxel: float) -> Solid:
         voxel,
         color=color.view(*shape, 3),
     )
+
+
+def _tensors(value: object) -> list[torch.Tensor]:
+    """All tensors that an object holds, whatever holds them in it."""
+    if isinstance(value, torch.Tensor):
+        return [value]
+    if isinstance(value, list | tuple):
+        return [found for one in value for found in _tensors(one)]
+    held = vars(value).values() if type(value).__module__.startswith("gsfluent") else ()
+    return [found for one in held for found in _tensors(one)]
+
+
+def test_an_object_is_moved_with_all_it_holds() -> None:
+    here = demo.make_object("melons", 2)
+    there = moved(here, torch.device("meta"))
+    assert len(_tensors(there)) == len(_tensors(here)) > 10
+    assert {value.device.type for value in _tensors(there)} == {"meta"}
+    assert {value.device.type for value in _tensors(here)} == {"cpu"}
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("name", ["watermelon", "melons", "cake", "bowl"])
+def test_a_gpu_draws_the_same_photographs(name: str) -> None:
+    here = demo.make_object(name, 1)
+    there = moved(here, torch.device("cuda"))
+    eyes = capture.ring_cameras(here, 3, on_table=True)
+    table = capture.Table(1)
+    for view in eyes:
+        image, cover = demo.photograph(here, view, 96, table=table)
+        drawn, covered = demo.photograph(there, view, 96, table=moved(table, torch.device("cuda")))
+        assert drawn.is_cuda and covered.is_cuda
+        assert float((cover - covered.cpu()).abs().mean()) < 2e-3
+        assert float((image - drawn.cpu()).abs().mean()) < 2e-3
+    image, mask = demo.cut_photograph(here.one(), 96)
+    cut, cut_mask = demo.cut_photograph(there.one(), 96)
+    assert float((image * mask[..., None] - (cut * cut_mask[..., None]).cpu()).abs().mean()) < 2e-3

@@ -13,7 +13,7 @@ from gsfluent.config import Shot
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import save_splats
-from gsfluent.progress import LineReporter, heard_warnings, heartbeat
+from gsfluent.progress import LineReporter, heard_warnings, heartbeat, quiet_logs
 from gsfluent.run.shot import run_shot
 
 
@@ -45,6 +45,23 @@ def test_a_silence_is_broken() -> None:
         task(1, 2, "")  # a reporter works on
     spoken.clear()
     assert not spoken.wait(0.2)  # over is over
+
+
+def test_a_silence_is_broken_while_small_runs_are_kept_quiet() -> None:
+    said = threading.Event()
+
+    class Hears(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            assert record.getMessage() == "100 % at work"
+            said.set()
+
+    log, hears = logging.getLogger("gsfluent"), Hears()
+    log.addHandler(hears)
+    try:
+        with quiet_logs("gsfluent"), heartbeat("gsfluent", lambda: "100 % at work", seconds=0.02):
+            assert said.wait(60.0)
+    finally:
+        log.removeHandler(hears)
 
 
 def test_progress_says_what_is_left(caplog: pytest.LogCaptureFixture) -> None:

@@ -120,7 +120,7 @@ class TouchPlan {
     const double dx = double(s_.dx);
     const HomeList<T>& list = s_.homes();
     for (int64_t h = 0; h < s_.clock->homes; ++h) {
-      const uint32_t shared = contact_.around_home(h);
+      const uint32_t shared = ContactPlan<T>::readers(contact_.around_home(h));
       if (shared == 0) continue;
       const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
       const int64_t end = begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin);

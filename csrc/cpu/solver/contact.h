@@ -7,6 +7,26 @@
 
 namespace gsf::cpu {
 
+// Neighbour o of node `local` of a block: which of the 27 blocks around it holds it, and where.
+struct NearTable {
+  uint8_t block[kBlockNodes][27], at[kBlockNodes][27];
+  constexpr NearTable() : block{}, at{} {
+    for (int local = 0; local < kBlockNodes; ++local)
+      for (int o = 0; o < 27; ++o) {
+        const int step[3] = {o / 9 - 1, o / 3 % 3 - 1, o % 3 - 1};
+        int b = 0, n = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          const int node = (local >> (4 - 2 * axis) & 3) + step[axis];
+          b = 3 * b + (node >> 2) + 1;
+          n = 4 * n + (node & 3);
+        }
+        block[local][o] = static_cast<uint8_t>(b);
+        at[local][o] = static_cast<uint8_t>(n);
+      }
+  }
+};
+constexpr NearTable kNear;
+
 template <typename T>
 class ContactPlan {
  public:
@@ -49,35 +69,36 @@ class ContactPlan {
     return at != keys_.end() && *at == key ? static_cast<int32_t>(at - keys_.begin()) : -1;
   }
 
-  // Whether nodes of the stencil at this cell lie in one of these blocks or next to it: those nodes
-  // are read where fields meet.
-  static bool reads(uint32_t blocks, uint32_t meta) {
-    for (uint32_t left = blocks; left != 0; left &= left - 1) {
-      const int n = __builtin_ctz(left);
+  // Cells whose stencil has nodes in one of these blocks or next to it, which are read where fields
+  // meet: bit 4 i + 2 j + k for the halves i, j, k of the block, the upper ones from cell 2 on.
+  static uint32_t readers(uint32_t blocks) {
+    uint32_t cells = 0;
+    for (; blocks != 0; blocks &= blocks - 1) {
+      const int n = __builtin_ctz(blocks);
       const int step[3] = {n / 9, n / 3 % 3, n % 3};
-      bool meets = true;
-      for (int axis = 0; axis < 3; ++axis) {
-        const int l = meta_cell(meta, axis);
-        meets = meets && (step[axis] == 1 || (step[axis] == 0 ? l <= 1 : l >= 2));
+      for (int half = 0; half < 8; ++half) {
+        bool meets = true;
+        for (int axis = 0; axis < 3; ++axis)
+          meets = meets && (step[axis] == 1 || (half >> (2 - axis) & 1) == step[axis] / 2);
+        if (meets) cells |= 1u << half;
       }
-      if (meets) return true;
     }
-    return false;
+    return cells;
+  }
+  // Whether the cell of this word is one of readers(blocks).
+  static bool reads(uint32_t readers, uint32_t meta) {
+    int half = 0;
+    for (int axis = 0; axis < 3; ++axis) half = 2 * half + (meta_cell(meta, axis) >= 2 ? 1 : 0);
+    return (readers >> half & 1u) != 0;
   }
 
   // Mass and moment of a field at a neighbour of node `local`, for core/mpm/contact.h.
   ContactSample<T> sample(int32_t slot, int local, int o) const {
     const int32_t row = row_[slot];
     if (row < 0) return {T(0), {T(0), T(0), T(0)}};
-    int block = 0, at = 0;
-    for (int axis = 0; axis < 3; ++axis) {
-      const int node = (local >> (4 - 2 * axis) & 3) + neighbour_step(o, axis);
-      block = 3 * block + (node >> 2) + 1;
-      at = 4 * at + (node & 3);
-    }
-    const int32_t other = around_[int64_t(row) * kNeighbours + block];
+    const int32_t other = around_[int64_t(row) * kNeighbours + kNear.block[local][o]];
     if (other < 0) return {T(0), {T(0), T(0), T(0)}};
-    const int64_t n = int64_t(other) * kBlockNodes + at;
+    const int64_t n = int64_t(other) * kBlockNodes + kNear.at[local][o];
     const T* m = static_cast<const T*>(s_.moments) + kContactMoments * n;
     return {T(static_cast<const double*>(s_.sums)[4 * n + 3]), {m[0], m[1], m[2]}};
   }

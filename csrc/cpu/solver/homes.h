@@ -142,7 +142,7 @@ class HomePass {
     const Range r = range(h);
     if (r.begin == r.end) return true;
     sort_home(h, r);
-    const uint32_t contact = contact_.around_home(h);
+    const uint32_t contact = contact_.around_home(h), readers = ContactPlan<T>::readers(contact);
     std::vector<T> pushes;
     const bool pushed =
         surface_.near(h) && surface_.pushes(h, s_.entry + r.begin, r.end - r.begin, pushes);
@@ -170,7 +170,7 @@ class HomePass {
         const int end = std::min(packet.run(lane), used);
         const int base = window_node(packet.meta[lane]);
         given.scatter(lane, end, tile + base);
-        if (contact != 0 && ContactPlan<T>::reads(contact, packet.meta[lane]))
+        if (contact != 0 && ContactPlan<T>::reads(readers, packet.meta[lane]))
           given.scatter_moment(lane, end, moment + base);
         if (pushed &&
             std::any_of(impulse + 4 * lane, impulse + 4 * end, [](T v) { return v != T(0); }))

@@ -8,6 +8,7 @@ the faces of a rigid wedge and slab, each of which meets only the matter on its 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from typing import NamedTuple
@@ -237,18 +238,24 @@ class BladeSet:
                 center = middle - 0.5 * (swept + run) * way + half * normal
                 pieces.append((center, normal, 0.5 * (swept - run)))
             for point, out, reach in pieces:
-                turn = torch.stack([edge, torch.linalg.cross(out, edge), out], dim=1)
                 rows.append(
                     ops.collider_row(
                         "face",
                         point=point.tolist(),
-                        orientation=quaternion_of(turn),
+                        orientation=_turn(tuple(edge.tolist()), tuple(out.tolist())),
                         extent=(0.5 * blade.width, reach, REACH * self.dx),
                         velocity=velocity,
                         only_cut=2 * number + bit + 1,
                     )
                 )
         return rows
+
+
+@functools.cache  # asked again at every look, for few directions
+def _turn(edge: tuple[float, ...], out: tuple[float, ...]) -> list[float]:
+    """Quaternion of a face along ``edge`` whose normal is ``out``."""
+    x, z = (torch.tensor(way, dtype=torch.float64) for way in (edge, out))
+    return quaternion_of(torch.stack([x, torch.linalg.cross(z, x), z], dim=1))
 
 
 def _length(blade: Blade) -> float:

@@ -1,0 +1,110 @@
+"""Films of inputs without a shot, small, and sheets of their frames to be judged by eye.
+
+    python scripts/study/first_films.py INPUT ... -o out/films [--size 160x120] [--frames 24]
+
+Each input is run as ``gsfluent run INPUT -o out/films/NAME`` runs it, into a smaller picture.
+Beside the folders lie NAME.png, frames at even distances in rows from left to right, and
+films.json: verdict, pieces, warnings, and the share of its outermost two rows and columns that
+matter covers in the first frame and in the fullest (what is cropped is there; dust and pieces that
+fly away are, too). A film that is there is not made again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import gsfluent.run.from_input as from_input
+from gsfluent.cli import main as gsfluent
+from gsfluent.io.atomic import write_json
+
+COLUMNS = 6
+_EDGE = 2  # px
+_DIFFERS = 24  # levels by which matter differs from the empty set
+
+
+def made(source: Path, out: Path) -> dict[str, Any]:
+    """Run one input, or take what is there; its run.json."""
+    if not (out / "video.mp4").is_file():
+        gsfluent(["run", str(source), "-o", str(out)])
+    return dict(json.loads((out / "run.json").read_text(encoding="utf-8")))
+
+
+def frames_of(path: Path) -> np.ndarray:
+    """All frames of a film, uint8 [T, H, W, 3]."""
+    import imageio_ffmpeg
+
+    film = imageio_ffmpeg.read_frames(str(path))
+    width, height = next(film)["size"]
+    return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in film])
+
+
+def sheet(film: np.ndarray, count: int) -> np.ndarray:
+    """Frames of a film [T, H, W, 3] at even distances, in rows."""
+    picked = film[np.linspace(0, len(film) - 1, min(count, len(film))).round().astype(int)]
+    _, height, width, _ = picked.shape
+    rows = -(-len(picked) // COLUMNS)
+    page = np.zeros((rows * height, COLUMNS * width, 3), np.uint8)
+    for index, frame in enumerate(picked):
+        row, column = divmod(index, COLUMNS)
+        page[row * height :, column * width :][:height, :width] = frame
+    return page
+
+
+def at_edges(film: np.ndarray) -> list[float]:
+    """Share of the outermost pixels that differ from the median of the film, frame by frame."""
+    still = np.median(film, axis=0)
+    differs = (np.abs(film.astype(float) - still) > _DIFFERS).any(axis=-1)
+    inner = np.zeros(differs.shape[1:], bool)
+    inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
+    return [float(mask[~inner].mean()) for mask in differs]
+
+
+def judged(source: Path, folder: Path, frames: int) -> dict[str, Any]:
+    """One film: made, laid out, and what can be said in numbers."""
+    from PIL import Image
+
+    name = source.parent.name if source.is_file() else source.name
+    record = made(source, folder / name)
+    film = frames_of(folder / name / "video.mp4")
+    Image.fromarray(sheet(film, frames)).save(folder / f"{name}.png")
+    edges = at_edges(film)
+    found = record["simulation"] or {}
+    return {
+        "name": name,
+        "verdict": record["verdict"],
+        "frames": len(film),
+        "pieces": (found.get("per_frame") or {}).get("pieces", [0])[-1],
+        "edge_first": edges[0],
+        "edge_most": max(edges),
+        "warnings": record["warnings"],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT")
+    parser.add_argument("-o", "--out", type=Path, default=Path("out/films"))
+    parser.add_argument("--size", default="160x120")
+    parser.add_argument("--frames", type=int, default=24, help="on a sheet")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    from_input.SETTINGS["output"] = {"size": [int(side) for side in args.size.split("x")]}
+    args.out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for source in args.inputs:
+        rows.append(judged(source, args.out, args.frames))
+        print(json.dumps(rows[-1]), flush=True)
+    write_json(args.out / "films.json", {"films": rows})
+
+
+if __name__ == "__main__":
+    sys.exit(main())
