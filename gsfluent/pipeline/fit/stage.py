@@ -114,18 +114,17 @@ class Fit(Stage):
             RunError: No start can be run.
         """
         dx = grid_spacing(scene, self.cells)
-        of_grid = {"grids": self.grids, "offset": self.offset}
         if self.laws:
             chosen = choose_laws(
                 scene, target, self.learn, self.laws, starts=self.starts, seed=self.seed, dx=dx,
-                runner=self.runner, progress=progress, **of_grid,
+                runner=self.runner, progress=progress, grids=self.grids, offset=self.offset,
             )  # fmt: skip
             task = Task(chosen.scene, target, chosen.unknowns, chosen.start, dx, SHARES, self.grids)
             made = conclude(chosen.scene, chosen.unknowns, self._last([task]), [])
             return dataclasses.replace(
                 made, laws=chosen.laws, report={**made.report, "laws": chosen.report}
             )
-        unknowns = unknowns_of(scene, self.learn, **of_grid)
+        unknowns = unknowns_of(scene, self.learn, grids=self.grids, offset=self.offset)
         make = functools.partial(Task, scene, target, unknowns)
         total = 1 + (self.starts if self.starts > 1 else 0)
         begin, tries = unknowns.start.tolist(), list[dict[str, Any]]()
