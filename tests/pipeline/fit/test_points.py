@@ -1,4 +1,4 @@
-"""Laws mixed at every point: shares move as one law does, and two laws in a block are told apart."""
+"""Laws mixed at every point: shares of one move as it does, and two in a block are told apart."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_share_of_one_is_that_law(logit: float) -> None:
     dt = alone.step({})
     found = mixed.run({"thing.logits": [logit] * 8}, 6, dt)
     wanted = alone.run({}, 6, dt)
-    assert float((found.position - wanted.position).abs().max()) < 1e-5
+    assert float((found.position - wanted.position).abs().max()) < 1e-4  # shares end at 1e-6
     moved = (wanted.position[-1] - wanted.position[0]).norm(dim=1).min()
     assert float(moved) > 0.02
 
