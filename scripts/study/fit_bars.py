@@ -66,7 +66,7 @@ def rubber(young: float, nu: float = 0.3) -> Material:
 
 def time() -> dict[str, Any]:
     """E, nu and velocity of 10,000 points, on one grid and on two; truth at half the spacing."""
-    cells, frames = 11, 8
+    cells, frames = 11, 11
     dx = SIDE / cells
     seen = tracks(falling(rubber(1e5)), 0.5 * dx, frames)
     guess = falling(rubber(10**4.5, 0.25), velocity=(0.0, 0.0, -1.8))
