@@ -34,7 +34,7 @@ from gsfluent.pipeline.fit.parameters import (
     parameter,
     read_learn,
 )
-from gsfluent.pipeline.fit.solve import SHARES, Problem, in_stages
+from gsfluent.pipeline.fit.solve import Problem, in_stages
 from gsfluent.pipeline.fit.task import EXTRAPOLATION, OFFSET, OFFSET_PRIOR, RATIO
 from gsfluent.scene.parts import Part
 from gsfluent.scene.scene import Scene
@@ -90,8 +90,8 @@ class Mixed(Forward):
 
     def _materials(self, values: Mapping[str, Any]) -> list[Material]:
         found = []
-        for law, expert in zip(self.laws, self.experts, strict=True):
-            keys = {f: f"{self.name}:{law}.{f}" for f in expert.reads}
+        for expert in self.experts:
+            keys = {f: f"{self.name}.{f}" for f in expert.reads}
             changes = {f: values[key] for f, key in keys.items() if key in values}
             found.append(dataclasses.replace(expert, **changes) if changes else expert)
         return found
@@ -189,7 +189,7 @@ def run_field(task: FieldTask) -> dict[str, Any]:
     for number, temperature in enumerate(TEMPERATURES):
         for grid in grids:
             grid.temperature = temperature
-        part = SHARES if number == 0 else (1.0,)
+        part = (0.5, 1.0) if number == 0 else (1.0,)
         found = in_stages(problem, free, finer=grids[1] if task.grids == 2 else None, shares=part)
         free = found.free
     runs = [grid.runs for grid in grids]
@@ -199,8 +199,11 @@ def run_field(task: FieldTask) -> dict[str, Any]:
 def _unknowns(task: FieldTask, grid: Mixed) -> Unknowns:
     learn = {key: b for key, b in flat(task.learn).items() if key.partition(".")[2] in VECTORS}
     made = list(read_learn(task.scene, learn).parameters) if learn else []
-    for law, expert in zip(task.laws, grid.experts, strict=True):
-        made += [parameter(f"{grid.name}:{law}", expert, f, True) for f in NUMBERS[law]]
+    # a number that several laws read is one until their regions are known: two moduli that share a
+    # place could not be told apart
+    wanted = {f: expert for law, expert in zip(task.laws, grid.experts, strict=True)
+              for f in NUMBERS[law]}  # fmt: skip
+    made += [parameter(grid.name, expert, f, True) for f, expert in wanted.items()]
     count = task.nodes**3 * (len(task.laws) - 1)
     made.append(Parameter(f"{grid.name}.{LOGITS}", (0.0,) * count, spread=BELIEF))
     if task.offset and task.scene.floor is not None and not task.scene.colliders:

@@ -182,11 +182,9 @@ class Fit(Stage):
         learn = [key for key in asked if key.partition(".")[2] in VECTORS]
         learn += [f"{label}.{name}" for law, label in labels.items() for name in NUMBERS[law]]
         unknowns = unknowns_of(made, learn, grids=self.grids, offset=self.offset)
-        named = {f"{label}.": f"{body.name}:{law}." for law, label in labels.items()}
         begin = unknowns.start.copy()
         for p, part in zip(unknowns.parameters, unknowns.slices().values(), strict=True):
-            key = next((new + p.name for old, new in named.items() if p.key == old + p.name), p.key)
-            value = mixed["values"].get(p.key, mixed["values"].get(key))
+            value = mixed["values"].get(p.key, mixed["values"].get(f"{body.name}.{p.name}"))
             if value is not None:
                 begin[part] = p.free(np.ravel(value).tolist())
         found = self._last([Task(made, target, unknowns, begin.tolist(), dx, (1.0,), self.grids)])
