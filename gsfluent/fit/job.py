@@ -28,7 +28,7 @@ from gsfluent.pipeline.fit import Fit, Found, Task, plain, run_task
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
-from gsfluent.scene.parts import Part
+from gsfluent.scene.scene import Part
 from gsfluent.sweep.engine import map as sweep_map
 from gsfluent.sweep.engine import required
 from gsfluent.targets.target import Target

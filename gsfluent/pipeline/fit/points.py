@@ -36,8 +36,7 @@ from gsfluent.pipeline.fit.parameters import (
 )
 from gsfluent.pipeline.fit.solve import Problem, in_stages
 from gsfluent.pipeline.fit.task import EXTRAPOLATION, OFFSET, OFFSET_PRIOR, RATIO
-from gsfluent.scene.parts import Part
-from gsfluent.scene.scene import Scene
+from gsfluent.scene.scene import Part, Scene
 from gsfluent.targets.target import Target
 
 Array = NDArray[np.float64]
