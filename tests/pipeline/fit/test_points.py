@@ -61,7 +61,7 @@ def test_halves_of_two_stiffnesses_are_one_of_their_mean() -> None:
 def test_two_laws_in_a_block_are_told_apart() -> None:
     """Rubber on clay, on the grid of the truth: 95 % of its matter under the right law."""
     below = {"law": "von_mises", "yield_stress": 1e3}
-    tracks, _ = seen(halves(below, elastic(1e5)), DX, frames=8)
+    tracks, _ = seen(halves(below, elastic(1e5)), DX, frames=6)
     fit = Fit(
         laws=["elastic", "von_mises"], per="point", nodes=2, cells=4, grids=1, offset=False
     )  # fmt: skip
