@@ -40,7 +40,7 @@ from gsfluent.scene.scene import Part, Scene
 from gsfluent.targets.target import Target
 
 Array = NDArray[np.float64]
-TEMPERATURES = (1.0, 0.2)
+TEMPERATURES = (1.0, 0.3, 0.1)
 """Of the softmax, one after the other."""
 BELIEF = 1.0
 """Standard deviation of a logit beforehand."""
