@@ -187,7 +187,8 @@ class Fit(Stage):
             value = mixed["values"].get(p.key, mixed["values"].get(f"{body.name}.{p.name}"))
             if value is not None:
                 begin[part] = p.free(np.ravel(value).tolist())
-        found = self._last([Task(made, target, unknowns, begin.tolist(), dx, (1.0,), self.grids)])
+        # moduli that were shared begin wrong: all frames at once would trade them for yield
+        found = self._last([Task(made, target, unknowns, begin.tolist(), dx, SHARES, self.grids)])
         report_progress(progress, 2, 2, f"{self.cells} cells")
         solid = body.solid
         assert solid is not None and solid.regions is not None
