@@ -24,11 +24,11 @@ from gsfluent.fit.read import read_masks, read_target
 from gsfluent.io import atomic_path, write_json
 from gsfluent.materials.laws import HANDBOOK, PARAMETERS
 from gsfluent.materials.material import Material
-from gsfluent.pipeline.fit import Fit, Found, Task, run_task
-from gsfluent.pipeline.fit.laws import plain
+from gsfluent.pipeline.fit import Fit, Found, Task, plain, run_task
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
+from gsfluent.scene.scene import Part
 from gsfluent.sweep.engine import map as sweep_map
 from gsfluent.sweep.engine import required
 from gsfluent.targets.target import Target
@@ -160,7 +160,7 @@ def fitted(shot: Shot, found: Found) -> dict[str, Any]:
         name, _, part = place.partition("/")
         if part and not entries[name].get("parts"):  # the preset's own
             entries[name]["parts"] = [
-                {"name": p.name, "where": dict(p.where), **p.overrides} for p in made[name].parts
+                {"name": p.name, "where": dict(p.where), **_written(p)} for p in made[name].parts
             ]
     if found.laws:
         for name, body in made.items():
@@ -187,6 +187,11 @@ def fitted(shot: Shot, found: Found) -> dict[str, Any]:
     kept = [e for e in values["events"] if e["type"] != "throw" or e.get("at") or not thrown]
     values["events"] = [*kept, *thrown.values()]
     return values
+
+
+def _written(part: Part) -> dict[str, Any]:
+    """What a shot can say of a part: no matter that only this scene has."""
+    return {k: v for k, v in part.overrides.items() if not isinstance(v, Material)}
 
 
 def _relay(entry: dict[str, Any], material: Material) -> None:

@@ -17,10 +17,13 @@ from gsfluent.config import load_shot
 from gsfluent.data import Camera, Frame
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
+from gsfluent.fit.job import fitted
 from gsfluent.fit.read import read_masks
 from gsfluent.geometry import look_at
 from gsfluent.io.images import save_image
 from gsfluent.pipeline.fit.forward import Forward
+from gsfluent.pipeline.fit.laws import with_laws
+from gsfluent.pipeline.fit.stage import Found
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.progress import LineReporter
 from gsfluent.targets.target import Followers
@@ -98,7 +101,29 @@ def test_a_law_is_found_for_a_shot_of_another(
     assert "Law of it" in (out / "fit.html").read_text()
     fitted = load_shot(out / "fitted.yaml").objects["it"].overrides
     assert fitted["law"] == "elastic" and "yield_stress" not in fitted
-    assert abs(np.log10(fitted["young_modulus"] / 1.2e5)) < 0.1
+    assert fitted["young_modulus"] == found["parameters"]["it.young_modulus"]["value"]
+
+
+def test_a_fitted_shot_says_what_its_parts_are(thrown: Path, tmp_path: Path) -> None:
+    words = yaml.safe_load((thrown / "shot.yaml").read_text())
+    where = {"sphere": [0.0, 0.0, 0.1, 0.1]}
+    words["objects"]["it"]["parts"] = [{"name": "core", "where": where, "young_modulus": 1e5}]
+    (thrown / "parts.yaml").write_text(yaml.safe_dump(words))
+    shot = load_shot(thrown / "parts.yaml")
+    scene, _ = shot_scene(
+        shot, thrown / "out", device=torch.device("cpu"), reporter=LineReporter(), make=True
+    )
+    laws = {"it": "elastic", "it/core": "von_mises"}
+    found = Found(
+        {"it/core.young_modulus": 2e5}, {}, {}, {}, with_laws(scene, laws), {}, laws
+    )  # fmt: skip
+    path = tmp_path / "fitted.yaml"
+    path.write_text(yaml.safe_dump(fitted(shot, found)))
+    core = load_shot(path).objects["it"]
+    entry = yaml.safe_load(path.read_text())["objects"]["it"]["parts"][0]
+    assert entry["law"] == "von_mises" and entry["young_modulus"] == 2e5
+    assert entry["where"] == where and entry["yield_stress"] == 1e-2 * 1e5
+    assert core.overrides["law"] == "elastic"
 
 
 @pytest.fixture(scope="module")

@@ -2,4 +2,6 @@
 
 from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = room(__name__, stage="Fit Found", task="Task run_task")
+__getattr__, __dir__, __all__ = room(
+    __name__, stage="Fit Found", task="Task run_task", laws="plain"
+)

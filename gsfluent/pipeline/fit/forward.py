@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -35,6 +35,28 @@ CFL = 0.4
 HASTE = 1.3
 """Margin of the time step for waves that matter under pressure carries faster."""
 MOST_STEPS = 200_000
+
+
+class Matter(NamedTuple):
+    """Points and materials of a run.
+
+    Attributes:
+        params: Rows of :func:`gsfluent.ops.return_mapping`, [M, 8].
+        alpha: Of each row at the start, [M].
+        law: int32 [M].
+        material: Row of each point, int32 [N copies].
+        mass: [kg], [N copies].
+        volume: [m^3], [N copies].
+        copies: How many points lie at each place; what a place shows is that of the first.
+    """
+
+    params: Tensor
+    alpha: Tensor
+    law: Tensor
+    material: Tensor
+    mass: Tensor
+    volume: Tensor
+    copies: int
 
 
 class TooFast(Exception):
@@ -152,9 +174,8 @@ class Forward:
             TooFast: The step was too long.
         """
         self.runs += 1
-        materials = self._materials(values)
-        params = torch.stack([m.parameters() for m in materials])
-        alpha = torch.tensor([float(m.start_alpha) for m in materials], dtype=torch.float64)
+        matter = self._matter(values)
+        copies = matter.copies
         position, velocity, affine = self.start(values)
         lift = position.new_tensor([0.0, 0.0, float(values.get(OFFSET, 0.0)) * self.dx])
         rows = self.rigid.start
@@ -162,12 +183,14 @@ class Forward:
         first = next((t for t in self.times if t > 0.0), dt)
         kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
         velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
+        body = self._fields()
         solver = ops.Solver(
-            position + lift, velocity.contiguous(), self._mass, self._volume, dx=self.dx,
-            law=self._laws, params=params, material=self._material,
-            alpha=alpha[self._material.long()], affine=affine.contiguous(),
-            deformation=torch.eye(3, dtype=torch.float64).repeat(self.count, 1, 1),
-            body=self._fields(), gravity=self.scene.gravity,
+            (position + lift).repeat(copies, 1), velocity.repeat(copies, 1), matter.mass,
+            matter.volume, dx=self.dx, law=matter.law, params=matter.params,
+            material=matter.material, alpha=matter.alpha[matter.material.long()],
+            affine=affine.repeat(copies, 1, 1),
+            deformation=torch.eye(3, dtype=torch.float64).repeat(copies * self.count, 1, 1),
+            body=None if body is None else body.repeat(copies), gravity=self.scene.gravity,
             colliders=rows if rows.shape[0] else None, sdf=self.rigid.sdf,
             friction=self.scene.friction, dt=dt,
         )  # fmt: skip
@@ -186,16 +209,25 @@ class Forward:
                 except (SolverError, ValueError) as error:
                     raise TooFast from error
                 now = time
-            place = solver.position.double() - lift
+            place = solver.position[: self.count].double() - lift
             map = solver.deformation
             assert map is not None  # tracked from the start
             if not bool(torch.isfinite(place).all()):
                 raise TooFast
             impulse = solver.impulse if rows.shape[0] else place.new_zeros(0, 3)
-            shown.append((place, map.double().clone(), impulse))
+            shown.append((place, map[: self.count].double().clone(), impulse))
         where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
         change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
         return Motion(where, maps, pushes, 0.5 * change.abs().amax())
+
+    def _matter(self, values: Mapping[str, Any]) -> Matter:
+        """Points and materials with these numbers."""
+        materials = self._materials(values)
+        return Matter(
+            torch.stack([m.parameters() for m in materials]),
+            torch.tensor([float(m.start_alpha) for m in materials], dtype=torch.float64),
+            self._laws, self._material, self._mass, self._volume, 1,
+        )  # fmt: skip
 
     def _materials(self, values: Mapping[str, Any]) -> list[Material]:
         """Materials of all layers with these numbers; parts keep their own."""

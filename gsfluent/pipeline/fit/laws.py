@@ -19,8 +19,7 @@ from gsfluent.materials.material import Material, nearest
 from gsfluent.pipeline.fit.parameters import VECTORS, Unknowns, flat, places
 from gsfluent.pipeline.fit.task import Runner, Task, run_task, unknowns_of
 from gsfluent.progress import Progress, report_progress
-from gsfluent.scene.parts import Body, Part
-from gsfluent.scene.scene import Scene
+from gsfluent.scene.scene import Body, Part, Scene
 from gsfluent.targets.target import Target
 
 NUMBERS: dict[str, tuple[str, ...]] = {

@@ -20,6 +20,8 @@ VECTORS = ("velocity", "angular_velocity")
 """What of a body is three numbers."""
 OFFSET = "floor.offset"
 """How much lower than the floor matter is held up, in cells: the grid feels a floor early."""
+LOGITS = "logits"
+"""Of an object: how much more the matter at its nodes is of each law than of the first."""
 FINER = "grid.extrapolation"
 """How far a motion goes on from the coarser grid through the finer one."""
 _NU, _ANGLE = 0.49, 60.0
@@ -69,7 +71,7 @@ class Parameter:
         """``log``, ``poisson_ratio``, ``friction_angle``, ``plain`` or the name of a vector."""
         if self.name in ("poisson_ratio", "friction_angle", *VECTORS):
             return self.name
-        return "plain" if self.key in (OFFSET, FINER) else "log"
+        return "plain" if self.key in (OFFSET, FINER) or self.name == LOGITS else "log"
 
     def free(self, value: Sequence[float]) -> Array:
         """The free coordinates of a value."""
@@ -220,7 +222,7 @@ def read_learn(scene: Scene, learn: Mapping[str, Mapping[str, Any]] | Sequence[s
             motion = tuple(float(v) for v in getattr(bodies[name], field))
             found.append(Parameter(f"{name}.{field}", motion, spread=_SPREAD[field]))
             continue
-        found.append(_parameter(name, made[name], field, bounds))
+        found.append(parameter(name, made[name], field, bounds))
     if not found:
         raise InputError("learn: nothing is to be learnt", "name melon.young_modulus and others")
     if sum(p.size for p in found) > 12:
@@ -231,7 +233,18 @@ def read_learn(scene: Scene, learn: Mapping[str, Mapping[str, Any]] | Sequence[s
     return Unknowns(found)
 
 
-def _parameter(place: str, material: Material, field: str, bounds: Any) -> Parameter:
+def parameter(place: str, material: Material, field: str, bounds: Any) -> Parameter:
+    """One number of a material.
+
+    Args:
+        place: What it is called before the point.
+        material: Where it starts.
+        field: Its name.
+        bounds: True, or lowest and highest.
+
+    Raises:
+        InputError: The law does not read it, it cannot be learnt, or the bounds are none.
+    """
     where, law = f"learn: {place}.{field}", material.law
     known = [f for f in READS[law] if f not in _FIXED or f == "poisson_ratio"]
     if law in ("nacc", "rigid") or field not in known:

@@ -11,8 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.fit.laws import choose_laws, known_laws
-from gsfluent.pipeline.fit.parameters import FINER, LIMITS, OFFSET, Parameter, Unknowns
+from gsfluent.pipeline.fit.laws import NUMBERS, choose_laws, known_laws
+from gsfluent.pipeline.fit.parameters import (
+    FINER,
+    LIMITS,
+    OFFSET,
+    VECTORS,
+    Parameter,
+    Unknowns,
+    flat,
+)
+from gsfluent.pipeline.fit.points import FieldTask, divided, run_field
 from gsfluent.pipeline.fit.solve import SHARES
 from gsfluent.pipeline.fit.task import Runner, Task, one_by_one, run_task, unknowns_of
 from gsfluent.pipeline.matter.points import grid_spacing
@@ -66,6 +75,10 @@ class Fit(Stage):
             ``melon.young_modulus``; of a part ``melon/rind.young_modulus``.
         laws: Tried for every object and part; what foretells frames that no search has seen is
             taken, with its numbers (:mod:`gsfluent.pipeline.fit.laws`).
+        per: ``part``; or ``point``: one object's law may be another at every place, and its parts
+            are found (:mod:`gsfluent.pipeline.fit.points`). They are regions of the solid of the
+            scene that comes back.
+        nodes: Of ``point``: along each axis.
         starts: How many; the first is the scene as it is.
         cells: Cells along the longest side of the largest body.
         grids: 2 to see on a grid twice as fine what the first does wrong, and take it out; or 1.
@@ -84,6 +97,8 @@ class Fit(Stage):
         learn: Mapping[str, Mapping[str, Any]] | Sequence[str] = (),
         *,
         laws: Sequence[str] = (),
+        per: str = "part",
+        nodes: int = 3,
         starts: int = 4,
         cells: int = 8,
         grids: int = 2,
@@ -98,7 +113,13 @@ class Fit(Stage):
             if not low <= value <= high:
                 raise InputError(f"fit: {name} is {value}", f"give a number from {low} to {high}")
         self.learn, self.starts, self.cells, self.grids = learn, starts, cells, grids
-        self.laws = known_laws(laws)
+        self.laws, self.per, self.nodes = known_laws(laws), per, nodes
+        if per not in ("part", "point") or (per == "point" and len(self.laws) < 2):
+            raise InputError(
+                f"fit: {len(self.laws)} laws per {per}", "give part, or point with two laws or more"
+            )
+        if not 2 <= nodes <= 8:
+            raise InputError(f"fit: nodes is {nodes}", "give a number from 2 to 8")
         self.offset, self.runner = offset, runner
 
     def forward(self, scene: Scene, target: Target, *, progress: Progress | None = None) -> Found:
@@ -114,18 +135,19 @@ class Fit(Stage):
             RunError: No start can be run.
         """
         dx = grid_spacing(scene, self.cells)
-        of_grid = {"grids": self.grids, "offset": self.offset}
+        if self.laws and self.per == "point":
+            return self._per_point(scene, target, dx, progress)
         if self.laws:
             chosen = choose_laws(
                 scene, target, self.learn, self.laws, starts=self.starts, seed=self.seed, dx=dx,
-                runner=self.runner, progress=progress, **of_grid,
+                runner=self.runner, progress=progress, grids=self.grids, offset=self.offset,
             )  # fmt: skip
             task = Task(chosen.scene, target, chosen.unknowns, chosen.start, dx, SHARES, self.grids)
             made = conclude(chosen.scene, chosen.unknowns, self._last([task]), [])
             return dataclasses.replace(
                 made, laws=chosen.laws, report={**made.report, "laws": chosen.report}
             )
-        unknowns = unknowns_of(scene, self.learn, **of_grid)
+        unknowns = unknowns_of(scene, self.learn, grids=self.grids, offset=self.offset)
         make = functools.partial(Task, scene, target, unknowns)
         total = 1 + (self.starts if self.starts > 1 else 0)
         begin, tries = unknowns.start.tolist(), list[dict[str, Any]]()
@@ -143,6 +165,39 @@ class Fit(Stage):
         found = self._last([make(begin, dx, SHARES, self.grids)])
         report_progress(progress, total, total, f"{self.cells} cells")
         return conclude(scene, unknowns, found, tries)
+
+    def _per_point(
+        self, scene: Scene, target: Target, dx: float, progress: Progress | None
+    ) -> Found:
+        """Where which law holds; then the numbers of the regions by a search of their own."""
+        asked = flat(self.learn)
+        field = FieldTask(
+            scene, target, self.laws, asked, dx, self.grids, self.offset, self.nodes
+        )  # fmt: skip
+        mixed = self.runner(run_field, [field])[0]
+        report_progress(progress, 1, 2, "laws per point")
+        made = divided(scene, self.laws, mixed["values"], self.nodes)
+        body, first = made.bodies[0], made.bodies[0].material.law
+        labels = {first: body.name, **{p.name: f"{body.name}/{p.name}" for p in body.parts}}
+        learn = [key for key in asked if key.partition(".")[2] in VECTORS]
+        learn += [f"{label}.{name}" for law, label in labels.items() for name in NUMBERS[law]]
+        unknowns = unknowns_of(made, learn, grids=self.grids, offset=self.offset)
+        begin = unknowns.start.copy()
+        for p, part in zip(unknowns.parameters, unknowns.slices().values(), strict=True):
+            value = mixed["values"].get(p.key, mixed["values"].get(f"{body.name}.{p.name}"))
+            if value is not None:
+                begin[part] = p.free(np.ravel(value).tolist())
+        # moduli that were shared begin wrong: all frames at once would trade them for yield
+        found = self._last([Task(made, target, unknowns, begin.tolist(), dx, SHARES, self.grids)])
+        report_progress(progress, 2, 2, f"{self.cells} cells")
+        solid = body.solid
+        assert solid is not None and solid.regions is not None
+        size = np.bincount(solid.regions[solid.occupancy].cpu().numpy(), minlength=len(self.laws))
+        share = {law: float(n / size.sum()) for law, n in zip(self.laws, size, strict=True)}
+        concluded = conclude(made, unknowns, found, [])
+        report = {**concluded.report, "shares": share, "mixed_rms": mixed["rms"]}
+        laws = {label: law for law, label in labels.items()}
+        return dataclasses.replace(concluded, laws=laws, report=report)
 
     def _last(self, tasks: list[Task]) -> dict[str, Any]:
         """The search that counts."""
