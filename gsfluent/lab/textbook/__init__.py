@@ -7,7 +7,6 @@ __getattr__, __dir__, __all__ = room(
     grid="stencil",
     laws="advance measure",
     nacc="Nacc return_map",
-    pff="PffField pff_solve",
     solver="Textbook Variant run_textbook",
     variant="Birth",
 )
