@@ -158,6 +158,8 @@ def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
     from matplotlib import pyplot
 
     there = [(name, said) for name, said in names if (out / f"{name}.npz").is_file()]
+    if not there:
+        return
     lines = math.ceil(len(there) / 3)
     figure, axes = pyplot.subplots(lines, 3, figsize=(12, 3.2 * lines), squeeze=False)
     for axis in axes.flat:
