@@ -73,37 +73,41 @@ def _nodes(position: Tensor, active: Tensor, field: Tensor, dx: float, blocks: B
     base = torch.floor(u).long()
     axis = torch.arange(-1, 2, device=device)
     around = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(27, 3)
-    own = _block_at(blocks.table, base[active] >> 2, blocks.origin)
-    seeds = torch.unique((field[active] * count + own)[own >= 0])
-    cell = blocks.coords.long()[seeds % count][:, None] + around
-    found = _block_at(blocks.table, cell, blocks.origin)
+    beside = _block_at(blocks.table, blocks.coords.long()[:, None] + around, blocks.origin)
+    own = _block_at(blocks.table, base >> 2, blocks.origin)
+    seeds = torch.unique((field * count + own)[active & (own >= 0)])
+    found = beside[seeds % count]
     wide = torch.where(found >= 0, (seeds // count * count)[:, None] + found, -1)
     used = torch.unique(wide[wide >= 0])
     number = torch.full((count * (int(field.max()) + 1),), -1, dtype=torch.int64, device=device)
     number[used] = torch.arange(used.shape[0], device=device)
 
-    def row(node: Tensor, of: Tensor) -> Tensor:
-        block = _block_at(blocks.table, node >> 2, blocks.origin)
-        place = torch.where(block >= 0, number[(of * count + block).clamp(min=0)], -1)
-        local = ((node[..., 0] & 3) * 4 + (node[..., 1] & 3)) * 4 + (node[..., 2] & 3)
-        return torch.where(place >= 0, place * 64 + local, -1)
+    def row(block: Tensor, local: Tensor, of: Tensor) -> tuple[Tensor, Tensor]:
+        """Row and block of the nodes at ``local``, -1 to 7 an axis, from the corner of a block."""
+        step, inner = (local >> 2) + 1, local & 3
+        there = beside[block.clamp(min=0), (step[..., 0] * 3 + step[..., 1]) * 3 + step[..., 2]]
+        place = torch.where(there >= 0, number[(of * count + there).clamp(min=0)], -1)
+        node = (inner[..., 0] * 4 + inner[..., 1]) * 4 + inner[..., 2]
+        return torch.where(place >= 0, place * 64 + node, -1), there
 
     corner = around.clamp(min=0)[(around != 0).all(dim=1)] * 2  # 0 or 2 on each axis
-    reach = (row(base[:, None] + corner, field[:, None]) >= 0).any(dim=1)
-    rows = reach.nonzero()[:, 0]
-    at = row(base[rows][:, None] + around + 1, field[rows][:, None])
+    reach = row(own[:, None], (base & 3)[:, None] + corner, field[:, None])[0]
+    rows = (reach >= 0).any(dim=1).nonzero()[:, 0]
+    local = (base[rows] & 3)[:, None] + around + 1
+    at = row(own[rows][:, None], local, field[rows][:, None])[0]
     o = position[rows] * (1.0 / dx) - 0.5 - base[rows]
     w = torch.stack([0.5 * (1 - o) ** 2, 0.75 - (o - 0.5) ** 2, 0.5 * o**2], dim=1)
     i, j, k = (around + 1).unbind(dim=1)
     weight = w[:, i, 0] * w[:, j, 1] * w[:, k, 2]
     inner = torch.stack(torch.meshgrid(*[torch.arange(4, device=device)] * 3, indexing="ij"), -1)
-    node = (blocks.coords.long()[used % count][:, None] * 4 + inner.view(64, 3)).view(-1, 3)
-    owner = (used // count).repeat_interleave(64)
+    inner = inner.view(64, 3)
     step = torch.tensor(_NEAR, device=device)
-    beside = node[:, None] + step
-    near = row(beside, owner[:, None])
-    near = torch.where(_block_at(blocks.table, beside >> 2, blocks.origin) < 0, -2, near)
-    return Nodes(rows, at, weight, near, (node.sum(dim=1) & 1) == 1)
+    near, there = row(
+        (used % count)[:, None, None], inner[None, :, None] + step, (used // count)[:, None, None]
+    )
+    near = torch.where(there < 0, -2, near).view(-1, 6)
+    odd = ((inner.sum(dim=1) & 1) == 1).repeat(used.shape[0])
+    return Nodes(rows, at, weight, near, odd)
 
 
 def _sums(nodes: Nodes, values: Tensor) -> Tensor:

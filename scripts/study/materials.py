@@ -22,6 +22,7 @@ _SHORT = {
     "tensile_strength": "tensile",
     "compressive_strength": "compressive",
     "fracture_energy": "G_c",
+    "toughness": "G_c",
     "cohesion": "beta",
     "hardening": "xi",
     "friction_angle": "phi",

@@ -18,8 +18,14 @@ inline constexpr double kBrokenDamage = 0.95;       // d of a broken point: peak
 inline constexpr double kDriveMax = 1e4;            // of H / psi_t: 1 - d is 1e-4 there
 // Broken matter forgets what it has opened and sheared beyond these, as torn liquid does: the
 // stiffness that is left must not pull across an open crack.
-inline constexpr double kBrokenVolumeMax = 0.44;  // J^2 - 1 of J = 1.2
-inline constexpr double kBrokenShearMax = 0.5;    // |d|
+inline constexpr double kBrokenVolumeMax = 0.44;                // J^2 - 1 of J = 1.2
+inline constexpr double kBrokenIsochoric = 0.8855488076521759;  // J^(-2/3) there
+inline constexpr double kBrokenShearMax = 0.5;                  // |d|
+constexpr bool isochoric_is(double isochoric, double j2m1) {
+  const double off = isochoric * isochoric * isochoric * (1.0 + j2m1) - 1.0;
+  return off < 1e-14 && off > -1e-14;
+}
+static_assert(isochoric_is(kBrokenIsochoric, kBrokenVolumeMax));
 
 // Column `damage` of a row: split, and 4 for AT2.
 enum EnergySplit : int { kSplitVolumetric = 0, kSplitNone = 1, kSplitSpectral = 2 };
@@ -50,13 +56,15 @@ GSF_HOST_DEVICE bool takes_part(T alpha, T peak, T active) {
   return alpha > active || peak > T(-kBrokenDamage);
 }
 
-// (J^2 - 1) - ln J^2 by its series, for |J^2 - 1| below a tenth.
-inline constexpr double kSeriesVolume = 0.1;
+// x - ln(1 + x) of x = J^2 - 1 between these, by the series of the inverse hyperbolic tangent of
+// z = x / (2 + x): x - 2 z is x z, so that nothing cancels.
+inline constexpr double kSeriesPressed = -0.3, kSeriesOpen = 0.45;
 template <typename T>
 GSF_HOST_DEVICE T volume_series(T x) {
-  T sum = T(1.0 / 16.0);
-  for (int n = 15; n >= 2; --n) sum = T(1.0 / double(n)) - x * sum;
-  return x * x * sum;
+  const T z = x / (T(2) + x), square = z * z;
+  T sum = T(1.0 / 25.0);
+  for (int n = 23; n >= 3; n -= 2) sum = T(1.0 / double(n)) + square * sum;
+  return z * (x - T(2) * square * sum);
 }
 
 // Root y of det((1 + y) I + d) = 1 for |d| up to a half, by three Newton steps (core/sym3.h).
@@ -151,7 +159,7 @@ GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym
   } else {
     const T shift = s.n < T(0.5) ? unit_det_shift_small(s.d) : unit_det_shift(s.d);
     const auto volume = [](T x) {
-      const bool small = x < T(kSeriesVolume) && x > T(-kSeriesVolume);
+      const bool small = x < T(kSeriesOpen) && x > T(kSeriesPressed);
       return small ? volume_series(x) : x - log1p(x);
     };
     const T all = split_of(m) == kSplitNone ? T(1) : T(0);

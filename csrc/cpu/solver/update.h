@@ -106,6 +106,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   [[maybe_unused]] P alpha_after(0), peak_after(0);
   P loss(0);
   Int phase{};
+  [[maybe_unused]] Int forgets{};  // broken, and beyond what it remembers
   P damage(0), history(0), all(0);
   if constexpr (kLaws == kDamageField) {
     phase =
@@ -117,7 +118,21 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       // without a spectral split, and what the series hold
       const P split =
           pack_of<T>([&](int lane) { return T(int(s.rows[row_of(lane) * kRowColumns + 5]) & 3); });
-      plain &= ~phase | ((split < P(1.5)) & (n2 <= P(0.25)) & (abs(j2m1) < P(kSeriesVolume)));
+      const Int broken = phase & (damage >= P(kBrokenDamage));
+      const Int opens = broken & (j2m1 > P(kBrokenVolumeMax)),
+                shears = broken & (n2 > P(kBrokenShearMax * kBrokenShearMax));
+      forgets = opens | shears;
+      if (mask_bits(forgets) != 0) {
+        mix(shears, d, P(kBrokenShearMax) / sqrt(n2) * d);
+        n2 = select<T>(shears, P(kBrokenShearMax * kBrokenShearMax), n2);
+        j2m1 = select<T>(opens, P(kBrokenVolumeMax), j2m1);
+        isochoric = select<T>(opens, P(kBrokenIsochoric), isochoric);
+        const P stretch = P(1) / isochoric;
+        mix(forgets, e,
+            add_diagonal(stretch * d, (stretch - P(1)) + stretch * unit_det_shift_small(d)));
+      }
+      plain &= ~phase | ((split < P(1.5)) & (n2 <= P(0.25)) & (j2m1 < P(kSeriesOpen)) &
+                         (j2m1 > P(kSeriesPressed)));
       all = select<T>(split > P(0.5), P(1), P(0));
       whole = ~phase | (peak < P(0));
       loss = select<T>(phase, row[7], P(0));
@@ -277,11 +292,13 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         s.peak[packet.index[lane]] = peak_after[lane];
       }
     }
-    if constexpr (kLaws == kDamageField)
+    if constexpr (kLaws == kDamageField) {
+      counts.plastic += __builtin_popcount(done & mask_bits(forgets));
       for (uint32_t left = done & mask_bits(phase); left != 0; left &= left - 1) {
         const int lane = __builtin_ctz(left);
         s.alpha[packet.index[lane]] = history[lane];
       }
+    }
     if constexpr (with_springs(kLaws)) {
       const uint32_t kept = done & mask_bits(relaxes);
       const P first[4] = {spring.xx, spring.yy, spring.zz, spring.xy};

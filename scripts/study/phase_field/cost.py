@@ -45,7 +45,7 @@ def bar(points: int, law: str, pulled: bool, device: str) -> ops.Solver:
     count = x.shape[0]
     v = 1e-3 * torch.randn(count, 3, generator=generator)
     if pulled:
-        v[:, 0] = 1.5 * (8.0 * (x[:, 0] / DX - 1.5 * wide)).sign().float()
+        v[:, 0] = 0.4 * (8.0 * (x[:, 0] / DX - 1.5 * wide)).sign().float()
     volume = torch.full((count,), DX**3 / 8.0)
     number, columns = ROWS[law]
     given: dict[str, Any] = {

@@ -28,6 +28,11 @@ HEADINGS = {
         "solver works with a reduced $G_c$, so that a long crack costs $G_c$; with `strength` "
         "it works with $G_c$."
     ),
+    "cost": (
+        "## What a step takes\n\n"
+        "A bar three times as long as wide, that trembles, or whose halves are pulled apart, by "
+        "both laws in turn; `cost.py`. Bars: 1.02 before, 1.3 meanwhile."
+    ),
     "bending": (
         "## Three-point bending\n\n"
         "Miehe et al. 2010: 8 x 2 mm, notch of 0.4 mm, E 20.8 GPa, $G_c$ 500 J/m², l 0.06 mm, "
@@ -130,6 +135,21 @@ def kalthoff(found: Sequence[Found]) -> str:
     return _table(("side, split", "direction [degrees]", "length [mm]", "s"), rows)
 
 
+def cost(found: Sequence[Found]) -> str:
+    """What a step takes beside one of NACC."""
+    rows = (
+        (
+            f["machine"], f"{row['points']:,}", "while it cracks" if row["pulled"] else "before",
+            f"{row['ms']['nacc']:.3f}", f"{row['ms']['phase_field']:.3f}", f"{row['ratio']:.2f}",
+            f"{100.0 * row['broken']['phase_field']:.1f} %",
+        )
+        for f in found
+        for row in f["rows"]
+    )  # fmt: skip
+    head = ("on", "points", "when", "NACC [ms]", "phase field [ms]", "ratio", "broken")
+    return _table(head, rows)
+
+
 def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
     """Damage at the end of the named jobs, side by side."""
     import matplotlib
@@ -138,6 +158,8 @@ def picture(out: Path, names: Sequence[tuple[str, str]]) -> None:
     from matplotlib import pyplot
 
     there = [(name, said) for name, said in names if (out / f"{name}.npz").is_file()]
+    if not there:
+        return
     lines = math.ceil(len(there) / 3)
     figure, axes = pyplot.subplots(lines, 3, figsize=(12, 3.2 * lines), squeeze=False)
     for axis in axes.flat:
@@ -165,7 +187,7 @@ def enter_page(found: Mapping[str, Found], out: Path, page: Path) -> None:
     parts = {
         "strip": strip, "branching": branching, "pmma": pmma, "kalthoff": kalthoff,
         "notch": lambda rows: peak(rows, 0.701, 5.55),
-        "bending": lambda rows: peak(rows, None, None),
+        "bending": lambda rows: peak(rows, None, None), "cost": cost,
     }  # fmt: skip
     for test, table in parts.items():
         if rows := of(test):
