@@ -1,6 +1,6 @@
 """Films of inputs without a shot, small, and sheets of their frames to be judged by eye.
 
-    python scripts/study/first_films.py INPUT ... -o out/films [--size 160x120] [--frames 24]
+    python scripts/pictures/first_films.py INPUT ... -o out/films [--size 160x120] [--frames 24]
 
 Each input is run as ``gsfluent run INPUT -o out/films/NAME`` runs it, into a smaller picture.
 Beside the folders lie NAME.png, frames at even distances in rows from left to right, and
