@@ -104,7 +104,11 @@ def cuda_extension() -> list:
                     "-DUSE_CUDA",
                     "-std=c++20",
                     "-O3",
-                    *(["-Xfatbin=-compress-all"] if RELEASE else ["-lineinfo"]),
+                    *(
+                        ["-Xfatbin=-compress-all", "--compress-mode=size"]
+                        if RELEASE
+                        else ["-lineinfo"]
+                    ),
                     "--expt-relaxed-constexpr",
                     # float32 quotients and roots to 2 ulp: the exact ones branch, and the kernels
                     # are bound by instructions; tests hold them to the CPU's

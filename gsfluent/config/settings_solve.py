@@ -127,8 +127,8 @@ class SolveSettings:
     devices: str = key(
         choice("one", "all"),
         "`all`: where the grid holds 1000000 points or more, all GPUs of this machine work at it, "
-        "each at a part, with the bits of one. They must reach each other's memory. On a CPU, and "
-        "where there is one GPU, no difference.",
+        "each at a part, with the bits of one, and pictures are drawn on them in turn. They must "
+        "reach each other's memory. On a CPU, and where there is one GPU, no difference.",
         "all",
         default="one",
     )

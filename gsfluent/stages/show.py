@@ -16,7 +16,7 @@ from gsfluent.export.write import write_exports
 from gsfluent.io import save_image
 from gsfluent.pipeline.light.from_shot import changed, light_of, looks_of
 from gsfluent.pipeline.render.figures import FilmFigures
-from gsfluent.pipeline.render.film import Film, poster_frame
+from gsfluent.pipeline.render.film import Film, drawn_by, poster_frame
 from gsfluent.pipeline.render.video import to_bytes, write_video
 from gsfluent.progress import Progress, report_progress
 from gsfluent.results.behind import Behind
@@ -37,7 +37,12 @@ def render_stage(context: RunContext) -> None:
     looks = [repr(light), repr(looks_of(shot))]
 
     def work(folder: Path) -> dict[str, Any]:
-        film = Film(context.out, shot, light, context.device)
+        devices = [context.device]
+        if shot.solve.devices == "all" and context.device.type == "cuda":
+            others = (torch.device("cuda", i) for i in range(torch.cuda.device_count()))
+            devices += [device for device in others if device != _numbered(context.device)]
+        films = [Film(context.out, shot, light, device) for device in devices]
+        film = films[0]
         report: dict[str, Any] = {"frames": len(film)}
         figures = FilmFigures(film.frame(0), film.around)
         counts: list[int] = []
@@ -46,9 +51,9 @@ def render_stage(context: RunContext) -> None:
 
         def pictures() -> Iterator[np.ndarray]:
             nonlocal drawing
-            for frame in film.frames():
+            for frame, draw in drawn_by(films):
                 start = time.perf_counter()
-                made = film.picture(frame)
+                made = draw()
                 picture = to_bytes(made.image)
                 drawing += time.perf_counter() - start
                 camera = film.cameras[frame.index]
@@ -71,6 +76,12 @@ def render_stage(context: RunContext) -> None:
     for name in ("video.mp4", "poster.png"):
         publish(result, name, context.out / name)
         context.record.values["outputs"][name.split(".")[0]] = name
+
+
+def _numbered(device: torch.device) -> torch.device:
+    """A GPU by its number."""
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return torch.device("cuda", index)
 
 
 def export_stage(context: RunContext) -> None:

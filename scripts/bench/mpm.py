@@ -193,15 +193,13 @@ def profile(n: int, cells: int, count: int) -> str:
         span = (event.time_range.start, event.time_range.end, name)
         spans.setdefault(event.device_index, []).append(span)
     lines = [f"{solver.count:,} points, {count} GPU(s); us a step, of {steps} steps"]
-    for device, found in sorted(spans.items()):
+    for card, found in sorted(spans.items()):
         total: dict[str, list[float]] = {}
         for start, end, name in found:
             total.setdefault(name, []).append(end - start)
         whole = max(end for _, end, _ in found) - min(start for start, _, _ in found)
         busy = sum(sum(times) for times in total.values())
-        lines.append(
-            f"cuda:{device}: {whole / steps:.1f}, of them idle {(whole - busy) / steps:.1f}"
-        )
+        lines.append(f"cuda:{card}: {whole / steps:.1f}, of them idle {(whole - busy) / steps:.1f}")
         for name, times in sorted(total.items(), key=lambda item: -sum(item[1]))[:24]:
             lines.append(f"  {name:<28}{sum(times) / steps:9.2f}  {len(times)} times")
     return "\n".join(lines) + "\n"

@@ -20,7 +20,9 @@ from scipy.spatial import cKDTree
 
 from gsfluent.cli import main
 from gsfluent.io import load_splats
-from gsfluent.pipeline.render.film import poster_frame
+from gsfluent.pipeline.light.from_shot import light_of
+from gsfluent.pipeline.render.film import Film, drawn_by, poster_frame
+from gsfluent.results.record import shot_of
 
 FRAMES = 10
 KEYS = {
@@ -78,6 +80,34 @@ def test_a_run_leaves_what_it_promises(finished: Path) -> None:
     for name in record["outputs"].values():
         assert (finished / str(name).split(" to ")[0]).is_file()
     assert not list(finished.rglob("*partial*"))
+
+
+def films(out: Path, count: int) -> list[Film]:
+    shot = shot_of(out)
+    return [Film(out, shot, light_of(shot), torch.device("cpu")) for _ in range(count)]
+
+
+def test_pictures_drawn_on_several_devices_in_turn_are_those_of_one(finished: Path) -> None:
+    want = [(frame.index, draw()) for frame, draw in drawn_by(films(finished, 1))]
+    assert [index for index, _ in want] == list(range(FRAMES))
+    for (index, one), (frame, draw) in zip(want, drawn_by(films(finished, 3)), strict=True):
+        picture = draw()
+        assert frame.index == index and one.report == picture.report
+        for name in ("image", "alpha", "depth"):
+            assert torch.equal(getattr(picture, name), getattr(one, name)), (index, name)
+
+
+def test_a_picture_that_cannot_be_drawn_ends_the_film_on_every_device(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    three = films(finished, 3)
+    monkeypatch.setattr(three[1], "picture", lambda *_: 1 / 0)
+    drawn = []
+    with pytest.raises(ZeroDivisionError):
+        for frame, draw in drawn_by(three):
+            draw()
+            drawn.append(frame.index)
+    assert drawn == [0]
 
 
 def test_the_video_is_h264_yuv420p_and_has_all_frames(finished: Path) -> None:

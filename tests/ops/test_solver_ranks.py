@@ -14,6 +14,7 @@ from test_solver_cpu import STATE, broken, mixed_rows, shuffled, small
 from gsfluent import ops
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.lab.world.shapes import parameters
+from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops import solver_ranks
 from gsfluent.ops.plasticity import PHASE_CODES
 
@@ -362,3 +363,38 @@ def test_a_device_that_does_not_answer_is_an_error(
 def test_nothing_is_cut_before_a_step() -> None:
     with pytest.raises(InputError, match="before a step"):
         ops.Solver(**small("elastic"), ranks=2).rank_counts()
+
+
+def test_room_for_more_points_keeps_those_that_are_there() -> None:
+    for width in (1, 4, 6, 9, 12):
+        values = torch.arange(7 * width, dtype=torch.float32).view(7, width)
+        for count in (9, 7, 5):
+            room = layout.more_room(layout.planes(values), width, count)
+            kept = min(7, count)
+            assert torch.equal(layout.from_planes(room, width)[:kept], values[:kept])
+
+
+def test_each_rank_has_room_for_its_share_and_gets_what_it_wants() -> None:
+    """On a device the clock of a rank says how many points and homes a cut would give it."""
+    solver = ops.Solver(**small("two bodies", torch.float32))
+    whole, n = solver._buffers, solver.count
+    for name, width in (("offset", 4), ("velocity", 12), ("strain", 6)):
+        setattr(whole, name, torch.zeros(width * n))  # as a device lays them out
+    cpu = torch.device("cpu")
+    parts = solver_ranks.Parts(whole, [cpu] * 4, solver.fields, *solver._settings())
+    assert whole.spare.numel() == 0
+    assert all(n / 4 <= part.id.numel() < 0.3 * n + 100 for part in parts.parts)
+    assert sum(part.home_start0.numel() for part in parts.parts) < 4 * whole.home_start0.numel()
+    first, second = parts.parts[:2]
+    first.id += 7
+    clock = first.clock
+    clock[layout.INDEX["cursor"]], clock[layout.INDEX["wanted_homes"]] = n // 2, 300
+    clock[layout.INDEX["grow"]] = 1
+    before, homes = second.id.numel(), first.home_start0.numel()
+    assert homes < 300
+    parts.grow()
+    assert first.id.numel() >= n // 2 and first.offset.numel() == 4 * first.id.numel()
+    assert bool((first.id[:before] == 7).all())
+    assert first.home_start0.numel() >= 300 and first.neighbour.shape[0] >= 300
+    assert second.id.numel() == before
+    assert int(first.clock[layout.INDEX["grow"]]) == 0

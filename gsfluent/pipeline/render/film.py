@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import itertools
+import threading
 from collections import deque
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +29,7 @@ from gsfluent.pipeline.light.wetness import Wetness, wet_colors, wet_gloss
 from gsfluent.pipeline.render.backdrop import Backdrop, covered_floor, no_background, object_radius
 from gsfluent.pipeline.render.camera import Action, cameras_for
 from gsfluent.pipeline.render.figures import cameras_around
-from gsfluent.pipeline.render.stage import Picture, Render, Room
+from gsfluent.pipeline.render.stage import Picture, Render, Room, RoomTurn
 from gsfluent.pipeline.render.studio import Studio, wants_dark
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.results.frames import SavedFrame, count_frames, frame_positions, load_frame
@@ -36,6 +39,8 @@ from gsfluent.results.record import read_frame
 _POSTER_DELAY = 0.08
 _READERS = {"cpu": 1}  # threads that read frames ahead
 _READERS_ELSEWHERE = 3  # where a picture takes less than to read a frame
+_AHEAD = 2  # pictures drawn ahead on each of several devices
+_READ = ("image", "alpha", "depth")  # of a picture, on the first of them
 _RESIDUE = 4.0  # voxels around a solid in which no background is believed
 
 
@@ -108,12 +113,17 @@ class Film:
                     ahead.append(pool.submit(self.frame, index))
                 yield frame
 
-    def picture(self, frame: SavedFrame) -> Picture:
-        """The picture of a frame in the film's camera."""
-        gaussians = frame.gaussians if self._albedo is None else self._albedo.apply(frame)
-        return self.drawn(gaussians, frame, self.cameras[frame.index])
+    def picture(self, frame: SavedFrame, turn: RoomTurn | None = None) -> Picture:
+        """The picture of a frame in the film's camera; ``turn`` knows the room of the one before.
 
-    def drawn(self, gaussians: Gaussians, frame: SavedFrame, camera: Camera) -> Picture:
+        Without ``turn`` it is the last picture of this film.
+        """
+        gaussians = frame.gaussians if self._albedo is None else self._albedo.apply(frame)
+        return self.drawn(gaussians, frame, self.cameras[frame.index], turn)
+
+    def drawn(
+        self, gaussians: Gaussians, frame: SavedFrame, camera: Camera, turn: RoomTurn | None = None
+    ) -> Picture:
         """The picture of splats at the moment of a frame, in any camera."""
         gloss, clear = gloss_of(self.shot, frame), transmission_of(self.shot, frame)
         shown, wet = gaussians, self._wetness.at(frame)
@@ -131,7 +141,7 @@ class Film:
             rigid=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,
-            room=self._room,
+            room=self._room if turn is None else turn,
             clear=clear_of(frame),
             wet=wet,
         )
@@ -142,6 +152,86 @@ class Film:
             made = replace(made, alpha=solid.alpha, depth=solid.depth)
         self._room = made.room
         return made
+
+
+class _Turns:
+    """The room of a film's pictures, handed on from each to the next one, whoever draws it."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._room: Room | None = None
+        self._next, self._failed = 0, False
+
+    def of(self, index: int) -> RoomTurn:
+        """The turn of picture ``index``: waits for the one before."""
+
+        def turn(fitting: Callable[[Room | None], Room]) -> Room:
+            with self._changed:
+                self._changed.wait_for(lambda: self._next >= index or self._failed)
+                if self._failed:
+                    raise RuntimeError("a picture before this one failed")
+                self._room = fitting(self._room)
+                self._advance(index + 1)
+                return self._room
+
+        return turn
+
+    def end(self, index: int, failed: bool) -> None:
+        """Picture ``index`` is drawn, lit or not, or it failed."""
+        with self._changed:
+            self._failed = self._failed or failed
+            if not failed:
+                self._changed.wait_for(lambda: self._next >= index or self._failed)
+            self._advance(index + 1)
+
+    def _advance(self, to: int) -> None:
+        self._next = max(self._next, to)
+        self._changed.notify_all()
+
+
+def drawn_by(films: Sequence[Film]) -> Iterator[tuple[SavedFrame, Callable[[], Picture]]]:
+    """All frames of a film in order, and what gives the picture of each.
+
+    Args:
+        films: The same film, on one device each. Frame i is drawn on the i-th of them, round
+            about, ahead of who asks for it; frame and picture come on the first. Of one film, who
+            asks draws. The pictures are the same either way.
+    """
+    if len(films) == 1:
+        for frame in films[0].frames():
+            yield frame, functools.partial(films[0].picture, frame)
+        return
+    turns, home = _Turns(), films[0].device
+
+    def draw(film: Film, reading: Future[SavedFrame], index: int) -> Picture:
+        failed = True
+        try:
+            on_gpu = film.device.type == "cuda"
+            with torch.cuda.device(film.device) if on_gpu else contextlib.nullcontext():
+                made = film.picture(reading.result(), turns.of(index))
+            failed = False
+        finally:
+            turns.end(index, failed)
+        return replace(made, **{name: getattr(made, name).to(home) for name in _READ})
+
+    with contextlib.ExitStack() as stack:
+        pools = [
+            (
+                stack.enter_context(ThreadPoolExecutor(_READERS_ELSEWHERE)),
+                stack.enter_context(ThreadPoolExecutor(1)),
+            )
+            for _ in films
+        ]
+        ahead: deque[tuple[Future[SavedFrame], Future[Picture]]] = deque()
+        count, most = len(films[0]), _AHEAD * len(films)
+        for index in range(count + most):
+            if index >= most and ahead:
+                reading, drawing = ahead.popleft()
+                yield reading.result().to(home), drawing.result
+            if index < count:
+                film, (readers, drawer) = films[index % len(films)], pools[index % len(films)]
+                reading = readers.submit(film.frame, index)
+                ahead.append((reading, drawer.submit(draw, film, reading, index)))
 
 
 def studio_is_dark(frame: SavedFrame, shot: Shot) -> bool:

@@ -10,6 +10,7 @@ each pixel once. Siblings that repair created are composited nearest-only throug
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,6 +71,10 @@ class Room:
         """Whether it will do for this matter too."""
         alike = self.count < _ROOM * count and count < _ROOM * self.count
         return alike and 0.5 * self.radius < matter.radius <= self.radius
+
+
+RoomTurn = Callable[[Callable[[Room | None], Room]], Room]
+"""Gives what makes a room of the one before the one before, and returns what it makes."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,7 @@ class Render(Stage):
         rigid: Tensor | None = None,
         backdrop: Backdrop | None = None,
         time: float = 0.0,
-        room: Room | None = None,
+        room: Room | RoomTurn | None = None,
         clear: Clear | None = None,
         wet: Tensor | None = None,
     ) -> Picture:
@@ -159,7 +164,8 @@ class Render(Stage):
             backdrop: Captured surroundings before the studio; None for none.
             time: Moment [s], for lamps that move.
             room: ``room`` of the picture before in a film, so that the grid behind normals and
-                occlusion stays what it was while the matter fits.
+                occlusion stays what it was while the matter fits; or who knows it, given what
+                makes this picture's of it.
             clear: The splats that are a liquid: drawn as its body and its surface, the same
                 in ``alpha`` as if they were opaque. None draws them as all others.
             wet: How much of a film of water each splat has, which mirrors, [N]; None for none.
@@ -186,9 +192,9 @@ class Render(Stage):
                 None if value is None else value[rest]
                 for value in (groups, gloss, plates, rigid, wet)
             )
-        lit, extras = None, None
+        lit, extras, made = None, None, None
         if lighting is not None:
-            lit, room = self._light(dense, camera, lighting, everything, room)
+            lit, made = self._light(dense, camera, lighting, everything, room)
             if (
                 clear is not None
                 and bool(clear.rows.all())
@@ -270,9 +276,9 @@ class Render(Stage):
             "gaussians": everything[0].count,
             "lamps": 0 if lit is None else len(lit.lamps),
             "shadow_maps": 0 if lit is None or lit.maps is None else len(lit.maps.depth),
-            "grid_cell": None if room is None else room.grid.cell,
+            "grid_cell": None if made is None else made.grid.cell,
         }
-        return Picture(image, alpha, depth, seen.normal, room, report)
+        return Picture(image, alpha, depth, seen.normal, made, report)
 
     def _camera(self, camera: Camera | None) -> Camera:
         camera = camera or self.camera
@@ -291,15 +297,20 @@ class Render(Stage):
         camera: Camera,
         lighting: Lighting,
         casters: tuple[Gaussians, Tensor | None],
-        room: Room | None,
+        room: Room | RoomTurn | None,
     ) -> tuple[Lit, Room]:
         """Occupancy of this state of the matter, and shadow maps of what casts shadows."""
         shading, groups = casters
         matter = bulk(shading)
-        if room is None or not room.fits(gaussians.count, matter):
+
+        def fitting(before: Room | None) -> Room:
+            if before is not None and before.fits(gaussians.count, matter):
+                return before
             radius = _ROOM * matter.radius
             grid = grid_for(gaussians, cell=self.normal_cell, radius=radius)
-            room = Room(grid, radius, gaussians.count)
+            return Room(grid, radius, gaussians.count)
+
+        room = room(fitting) if callable(room) else fitting(room)
         lamps = lighting.drawn()
         faces = faces_of(lamps, matter)
         large = max(camera.width, camera.height) > _LARGE
