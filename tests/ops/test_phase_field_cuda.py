@@ -62,7 +62,8 @@ def test_bodies_that_touch_crack_each_for_itself(dtype: torch.dtype, bar: float)
     assert float(want.peak.max()) > 0.0
     for name in NAMES:
         assert error(getattr(have, name), getattr(want, name)) <= bar, name
-    assert error(have.impulse, want.impulse) <= 1e-6  # its unit holds speeds of 8e6 m/s
+    # its unit holds speeds of 8e6 m/s; sums of float32 stresses stand behind it
+    assert error(have.impulse, want.impulse) <= max(1e-6, 0.1 * bar)
 
 
 def test_no_damage_goes_through_contact() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.materials import Material
 from gsfluent.pipeline.fit.forward import Forward
+from gsfluent.scene.parts import Part
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 from gsfluent.targets.target import Followers
@@ -66,3 +68,11 @@ def seen(
 
 
 __all__ = ["SIDE", "Points", "elastic", "scene", "seen", "solid"]
+
+
+def halves(below: dict[str, Any], material: Material) -> Any:
+    """The cube, whose lower half is another thing."""
+    made = scene(material, velocity=(0.0, 0.0, -2.0))
+    part = Part("low", {"box": [[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5 * SIDE]]}, below)
+    made.bodies[0] = dataclasses.replace(made.bodies[0], parts=(part,))
+    return made

@@ -1,6 +1,6 @@
 """Materials learnt from tracks: error and bands on random scenes, truth by the whole simulation.
 
-python scripts/study/fit_tracks.py --scenes 10 --jobs 16 --minutes 8  # a process a core; goes on
+python scripts/study/fit/tracks.py --scenes 10 --jobs 16 --minutes 8  # a process a core; goes on
 
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
@@ -32,7 +32,7 @@ from gsfluent.pipeline.fit.task import RATIO
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 
-DATA = Path(__file__).resolve().parents[2] / "docs" / "measured" / "data"
+DATA = Path(__file__).resolve().parents[3] / "docs" / "measured" / "data"
 PAGE = DATA.parent / "fit.md"
 FPS, FRAMES, TRACKS, SIDE, GAP = 24.0, 14, 150, 0.3, 0.25
 VOXELS = 48

@@ -1,8 +1,8 @@
 """How often the law that made a motion is found, by the frames that no search has seen.
 
-Scenes as of fit_tracks.py, the matter by turns; each is fitted under every law.
+Scenes as of tracks.py, the matter by turns; each is fitted under every law.
 
-python scripts/study/fit_laws.py --jobs 10 --minutes 8
+python scripts/study/fit/laws.py --jobs 10 --minutes 8
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit_tracks import DATA, FPS, KINDS, PAGE, SIDE, in_pool, read, scene_of, seen
+from tracks import DATA, FPS, KINDS, PAGE, SIDE, in_pool, read, scene_of, seen
 
 from gsfluent.figure.markdown import enter
 from gsfluent.pipeline.fit.laws import choose_laws

@@ -1,6 +1,6 @@
 """Two bars of fits: the time of one, and how much of a block of two laws is told apart.
 
-python scripts/study/fit_bars.py --only time block
+python scripts/study/fit/bars.py --only time block
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from fit_tracks import DATA, FPS, PAGE, SIDE
+from tracks import DATA, FPS, PAGE, SIDE
 
 from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.figure.markdown import enter

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from fit_scenes import SIDE, elastic, scene, seen
-from test_laws import halves
+from fit_scenes import SIDE, elastic, halves, scene, seen
 
 from gsfluent.errors import InputError
 from gsfluent.materials import Material

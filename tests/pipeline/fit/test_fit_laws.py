@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import Any
 
 import pytest
 import torch
-from fit_scenes import SIDE, elastic, scene, seen
+from fit_scenes import SIDE, elastic, halves, scene, seen
 
 from gsfluent.errors import InputError, RunError
 from gsfluent.materials import Material
@@ -16,7 +14,6 @@ from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.laws import learn_under, pick, places, under_law, with_laws
 from gsfluent.pipeline.fit.parameters import read_learn
-from gsfluent.scene.parts import Part
 from gsfluent.targets import Points
 
 CLAY = Material("clay", 1e5, 0.3, 1000.0, law="von_mises", yield_stress=2e3)
@@ -38,14 +35,6 @@ def test_the_law_that_made_a_motion_is_found(truth: Material) -> None:
     key = "thing.viscosity" if truth.law == "fluid" else "thing.young_modulus"
     want = truth.viscosity if truth.law == "fluid" else truth.young_modulus
     assert abs(math.log10(found.values[key] / float(want))) < 0.1  # type: ignore[arg-type]
-
-
-def halves(below: dict[str, Any], material: Material) -> Any:
-    """The cube, whose lower half is another thing."""
-    made = scene(material, velocity=(0.0, 0.0, -2.0))
-    part = Part("low", {"box": [[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5 * SIDE]]}, below)
-    made.bodies[0] = dataclasses.replace(made.bodies[0], parts=(part,))
-    return made
 
 
 def test_a_number_of_a_part_is_learnt() -> None:
