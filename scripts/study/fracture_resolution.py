@@ -526,7 +526,7 @@ def page(lines: Path, device: str) -> int:
         entered["runs"] = table(_HEAD, [line(r) for r in runs])
     if falls := [r for r in runs if r["part"] != "loose" or r["name"] == "bread torn"]:
         entered["exponents"] = exponents(falls)
-    parted = [r for r in of("drop") if any(o["name"] == r["name"] and o["seed"] for o in rows)]
+    parted = [r for r in of("drop") if any(o["name"] == r["name"] and o.get("seed") for o in rows)]
     if parted:
         entered["seeds"] = seeds_table(parted)
     if bench := of("bench"):
