@@ -124,36 +124,22 @@ def photometric_loss(
     Source: Kerbl et al. 2023, equation 7; docs/theory/losses.md.
     """
     loss, figures, _, _ = _photometric(
-        image, target, ssim_weight, padding, valid, alpha, mask, backdrop, mask_weight
-    )
+        image, target, ssim_weight=ssim_weight, padding=padding, valid=valid, alpha=alpha,
+        mask=mask, backdrop=backdrop, mask_weight=mask_weight,
+    )  # fmt: skip
     return _named(loss, figures)
 
 
 @torch.no_grad()
 def photometric_slopes(
-    image: Tensor,
-    target: Tensor,
-    *,
-    ssim_weight: float = 0.2,
-    padding: str = "valid",
-    valid: Tensor | None = None,
-    alpha: Tensor | None = None,
-    mask: Tensor | None = None,
-    backdrop: Tensor | None = None,
-    mask_weight: float = 0.0,
+    image: Tensor, target: Tensor, **options: Any
 ) -> tuple[Photometric, Tensor, Tensor | None]:
     """:func:`photometric_loss` and its gradients at once, without autograd.
 
     Args:
-        image: See :func:`photometric_loss`, also of all others.
+        image: See :func:`photometric_loss`.
         target: See there.
-        ssim_weight: See there.
-        padding: See there.
-        valid: See there.
-        alpha: See there.
-        mask: See there.
-        backdrop: See there.
-        mask_weight: See there.
+        options: All others of :func:`photometric_loss`.
 
     Returns:
         The loss, its gradient with respect to the image [H, W, C], and to alpha [H, W] if given.
@@ -165,10 +151,8 @@ def photometric_slopes(
     Gradient: none.
     Determinism: as :func:`photometric_loss`.
     """
-    loss, figures, of_image, of_alpha = _photometric(
-        image, target, ssim_weight, padding, valid, alpha, mask, backdrop, mask_weight, True
-    )
-    return _named(loss, figures), of_image, None if alpha is None else of_alpha
+    loss, figures, of_image, of_alpha = _photometric(image, target, slopes=True, **options)
+    return _named(loss, figures), of_image, None if options.get("alpha") is None else of_alpha
 
 
 def _named(loss: Tensor, figures: Tensor) -> Photometric:
@@ -177,17 +161,10 @@ def _named(loss: Tensor, figures: Tensor) -> Photometric:
 
 
 def _photometric(
-    image: Tensor,
-    target: Tensor,
-    ssim_weight: float,
-    padding: str,
-    valid: Tensor | None,
-    alpha: Tensor | None,
-    mask: Tensor | None,
-    backdrop: Tensor | None,
-    mask_weight: float,
-    slopes: bool = False,
-) -> tuple[Tensor, ...]:
+    image: Tensor, target: Tensor, *, ssim_weight: float = 0.2, padding: str = "valid",
+    valid: Tensor | None = None, alpha: Tensor | None = None, mask: Tensor | None = None,
+    backdrop: Tensor | None = None, mask_weight: float = 0.0, slopes: bool = False,
+) -> tuple[Tensor, ...]:  # fmt: skip
     """Loss, figures and gradients, as the operator gives them."""
     op = "photometric_loss"
     inside = _check_images(op, image, target, padding)
