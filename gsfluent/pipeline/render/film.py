@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
+import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -160,15 +161,15 @@ class _Turns:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._room: Room | None = None
-        self._next, self._failed = 0, False
+        self._next, self._failed = 0, math.inf  # the first picture that failed
 
     def of(self, index: int) -> RoomTurn:
         """The turn of picture ``index``: waits for the one before."""
 
         def turn(fitting: Callable[[Room | None], Room]) -> Room:
             with self._changed:
-                self._changed.wait_for(lambda: self._next >= index or self._failed)
-                if self._failed:
+                self._changed.wait_for(lambda: self._next >= index or self._failed < index)
+                if self._failed < index:
                     raise RuntimeError("a picture before this one failed")
                 self._room = fitting(self._room)
                 self._advance(index + 1)
@@ -179,9 +180,11 @@ class _Turns:
     def end(self, index: int, failed: bool) -> None:
         """Picture ``index`` is drawn, lit or not, or it failed."""
         with self._changed:
-            self._failed = self._failed or failed
-            if not failed:
-                self._changed.wait_for(lambda: self._next >= index or self._failed)
+            if failed:  # those before it go on
+                self._failed = min(self._failed, index)
+                self._changed.notify_all()
+                return
+            self._changed.wait_for(lambda: self._next >= index or self._failed < index)
             self._advance(index + 1)
 
     def _advance(self, to: int) -> None:
