@@ -229,8 +229,10 @@ def _arrays(folder: Path, index: int, *names: str) -> dict[str, np.ndarray]:
         LookupError: A name is in none.
     """
     path = frame_path(folder, index)
-    elsewhere = _kept(_head(read_npz(path, ("head",))), index)
-    arrays = read_npz(path, [name for name in names if name not in elsewhere] if names else None)
+    arrays = read_npz(path, ("head",) if names else None)
+    elsewhere = _kept(_head(arrays), index)
+    if names:
+        arrays = read_npz(path, [name for name in names if name not in elsewhere])
     earlier: dict[int, list[str]] = {}
     for name in names or elsewhere:
         if name in elsewhere:

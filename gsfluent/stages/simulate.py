@@ -195,11 +195,8 @@ def simulate_stage(context: RunContext) -> None:
                 save_partition(folder, partition)
             written = grown
 
-        saved_at, cost, frame_files = (
-            time.monotonic(),
-            0.0,
-            FrameWriter(folder, frames.run.next_frame),
-        )
+        saved_at, cost = time.monotonic(), 0.0
+        frame_files = FrameWriter(folder, frames.run.next_frame)
 
         def finish(moment: Moment) -> None:
             """Wrap up a frame, while the run goes on to the next ones."""
