@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from gsfluent._check import check_tensor
 from gsfluent.ops.plasticity import INSTANT, LAWS, elastic_energy, return_mapping
@@ -35,11 +36,20 @@ def check_viscous(op: str, viscous: Tensor, like: Tensor) -> None:
         )
 
 
+_plain: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+
+
 def _elastic(law: Tensor, params: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of the neo-Hookean law with the stiffness of these."""
+    """Rows of the neo-Hookean law with the stiffness of these, made and checked once a table."""
+    known = None if params.is_inference() else _plain.get(params)
+    if known is not None and known[0] == params._version:
+        return known[1]
     plain = torch.zeros_like(params)
     plain[:, :2], plain[:, 6] = params[:, :2], params[:, 6]
-    return torch.full_like(law, LAWS["elastic"]), plain
+    rows = torch.full_like(law, LAWS["elastic"]), plain
+    if not (params.is_inference() or params.requires_grad):
+        _plain[params] = params._version, rows
+    return rows
 
 
 def _kept_by_unloading(

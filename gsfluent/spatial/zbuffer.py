@@ -13,6 +13,8 @@ from torch import Tensor
 
 from gsfluent.data import Camera
 
+_AT_ONCE = {"cpu": 1 << 18}  # pixels of points looked at in one go: as the cache is
+_AT_ONCE_ELSEWHERE = 1 << 22  # where launches cost more than memory
 LARGEST = 24.0
 """Discs are drawn no larger than this radius [px], which bounds the time for points very near."""
 
@@ -48,14 +50,16 @@ def nearest_points(points: Tensor, radius: Tensor | float, camera: Camera) -> Te
         key = (z[rows].float().contiguous().view(torch.int32).long() << 32) | rows
         column, line = u.floor(), v.floor()
         most = math.ceil(float(reach.amax()) - 0.5)
-        for dy in range(-most, most + 1):
-            for dx in range(-most, most + 1):
-                x, y = column + dx, line + dy
-                inside = (x + 0.5 - u).square() + (y + 0.5 - v).square() <= reach.square()
-                if dx == dy == 0:
-                    inside = torch.ones_like(inside)
-                inside &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
-                pixel = (y * width + x)[inside].long()
-                best.scatter_reduce_(0, pixel, key[inside], "amin")
+        most_at_once = _AT_ONCE.get(points.device.type, _AT_ONCE_ELSEWHERE)
+        side = torch.arange(-most, most + 1, device=points.device)
+        steps = torch.cartesian_prod(side, side)
+        for part in steps.split(max(1, most_at_once // rows.numel())):
+            dx, dy = part.to(u).T[..., None]
+            x, y = column + dx, line + dy
+            inside = (x + 0.5 - u).square() + (y + 0.5 - v).square() <= reach.square()
+            inside |= (part == 0).all(dim=1)[:, None]
+            inside &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            pixel = (y * width + x)[inside].long()
+            best.scatter_reduce_(0, pixel, key.expand_as(inside)[inside], "amin")
     empty = best == torch.iinfo(torch.int64).max
     return torch.where(empty, -1, best & 0xFFFFFFFF).view(height, width)

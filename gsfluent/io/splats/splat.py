@@ -32,7 +32,7 @@ def save_splat(gaussians: Gaussians, path: str | Path) -> None:
     """
     host = gaussians.validated(f"save to {path}").to("cpu", torch.float64)
     # viewers that draw while they load show what matters first
-    order = torch.argsort(-host.scales.prod(dim=1) * host.opacities, stable=True)
+    order = torch.argsort(-geometry.product(host.scales) * host.opacities, stable=True)
     host = host.select(order)
     rows = np.zeros(host.count, dtype=_ROW)
     rows["position"], rows["scale"] = host.means.numpy(), host.scales.numpy()

@@ -261,7 +261,7 @@ class RigidSet:
                 half = torch.stack([half[2] * 0 + radius, half[2] * 0 + radius, half[2] + radius])
             elif kind == 5:
                 half = torch.maximum(-row[6:9], row[6:9] + (half - 1) * radius)
-            box = (2.0 * half + self.dx).prod()
+            box = geometry.product(2.0 * half + self.dx)
             moments = row[columns.INERTIA : columns.EXTENT]
             turns = 0.0
             if bool((moments > 0).any()):

@@ -382,7 +382,7 @@ def _chips(row: Tensor, number: Tensor, seed: Tensor, size: Tensor, edge: Tensor
     draw = 0.5 + 0.5 * hashes(seed, range(7, 9))
     low, high = draw.new_tensor(FLAT).unbind(dim=1)
     half = torch.cat([torch.ones_like(draw[:, :1]), low + draw * (high - low)], dim=1)
-    half = half * (math.pi / 6.0 / half.prod(dim=1, keepdim=True)).pow(1.0 / 3.0)
+    half = half * (math.pi / 6.0 / geometry.product(half)[:, None]).pow(1.0 / 3.0)
     half = 0.5 * half * size[:, None]
     frame = torch.nn.functional.normalize(hashes(seed, range(9, 13)) + 1e-6, dim=1)
     lag = (0.5 + 0.5 * hashed(seed, 14)) * (1.0 - (size / (2.0 * edge)).clamp(max=1.0))

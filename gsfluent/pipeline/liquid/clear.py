@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
 from gsfluent.data import Camera, Gaussians
-from gsfluent.geometry import quaternion_to_matrix
+from gsfluent.geometry import product, quaternion_to_matrix
 
 FACE_ON = 0.02
 """Share that is reflected straight on, by an index of 1.33."""
@@ -92,7 +92,7 @@ def body_opacities(splats: Gaussians, clear: Clear, eye: Tensor) -> Tensor:
     turn = quaternion_to_matrix(splats.quats)
     way = normalize(splats.means - eye, dim=1)
     along = (turn.mT @ way[..., None])[..., 0] / splats.scales
-    shadow = 2.0 * math.pi * splats.scales.prod(dim=1) * along.norm(dim=1)
+    shadow = 2.0 * math.pi * product(splats.scales) * along.norm(dim=1)
     thick = (clear.volume.to(shadow) / shadow.clamp(min=1e-30)).clamp(min=1e-12)
     return 1.0 - torch.exp(-clear.attenuation.to(shadow) * thick)
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.geometry import quaternion_to_matrix
+from gsfluent.geometry import product, quaternion_to_matrix
 from gsfluent.pipeline.liquid.depth import deep
 from gsfluent.spatial.neighbours import nearest_rows
 
@@ -112,12 +112,12 @@ def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> E
     long = shape.clamp(min=1.0 / RATIO)
     size = torch.lerp(torch.full_like(known, SPRAY), torch.ones_like(known), known)
     volume_left = (CLOSED * edge[:, None] * size) ** 3
-    scales = long * (volume_left / long.prod(dim=1, keepdim=True)).pow(1.0 / 3.0)
+    scales = long * (volume_left / product(long)[:, None]).pow(1.0 / 3.0)
     # In a film of n points on the disc of the neighbourhood each has reach^2 pi / n.
     sheet = reach * (torch.pi / inside[:, None].clamp(min=1.0)).sqrt()
     thin = known * (1.0 - shape[:, 2:]) * (2.0 * shape[:, 1:2]).clamp(max=1.0)
     wide = torch.maximum(scales[:, :2], thin * FILM * sheet)
-    thick = volume_left / wide.prod(dim=1, keepdim=True)
+    thick = volume_left / product(wide)[:, None]
     thick = torch.maximum(thick, wide[:, :1] / RATIO)
     thick = torch.minimum(thick, wide[:, 1:])
     scales = torch.cat([wide, thick], dim=1)

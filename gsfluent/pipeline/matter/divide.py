@@ -61,7 +61,7 @@ def divide_wide(splats: Gaussians, widest: float) -> Gaussians:
         most = torch.tensor(_HALF, device=rows.device)[across.sum(dim=1)]
         half = torch.ceil(_REACH * splats.scales[rows] / (NARROW * widest * STEP) - 0.5).long()
         half = torch.where(across, half.clamp(min=1).minimum(most[:, None]), 0)
-        if float((2.0 * half + 1.0).prod(dim=1).sum()) <= MOST:
+        if float(geometry.product(2.0 * half + 1.0).sum()) <= MOST:
             break
         widest *= 1.25
     parts = [splats.select(~wide)]

@@ -429,12 +429,9 @@ def shared_out(opacity: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor,
     # sum_i sum_k C(i-1, k) (-1)^k x^(k+1) / sqrt(k+1); the inner alternating sums lose digits for
     # large i only where x is near 1, and x = each falls with the number of copies.
     for i in range(1, int(copies.max()) + 1):
-        k = torch.arange(i, dtype=torch.float64, device=opacity.device)
-        choose = torch.exp(
-            torch.lgamma(k.new_tensor(i)) - torch.lgamma(k + 1) - torch.lgamma(i - k)
-        )
-        term = choose * (-1.0) ** k / (k + 1).sqrt()
-        inner = (term * each[:, None] ** (k + 1)).sum(1)
+        terms = [math.comb(i - 1, k) * (-1.0) ** k / math.sqrt(k + 1) for k in range(i)]
+        power = torch.arange(1, i + 1, device=opacity.device)
+        inner = (each.new_tensor(terms) * each[:, None] ** power).sum(1)
         total += torch.where(copies >= i, inner, torch.zeros_like(inner))
     factor = opacity / total.clamp_min(1e-12)
     return each.to(scales), scales * factor.to(scales)[:, None]

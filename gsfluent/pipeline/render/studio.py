@@ -62,7 +62,7 @@ def wants_dark(gaussians: Gaussians) -> bool:
     if gaussians.count == 0:
         return False
     two = gaussians.scales.topk(2, dim=1).values.double()
-    weight = two.prod(1) * gaussians.opacities.double()
+    weight = two[:, 0] * two[:, 1] * gaussians.opacities.double()
     linear = to_linear(gaussians.colors().double().clamp(0.0, 1.0))
     luminance = linear @ linear.new_tensor(_LUMINANCE)
     mean = float((luminance * weight).sum() / weight.sum().clamp(min=1e-30))

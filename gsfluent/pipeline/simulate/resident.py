@@ -11,6 +11,7 @@ solver goes on with the fields and the faces that follow.
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import torch
@@ -418,7 +419,7 @@ def _box(position: Tensor, dx: float) -> int:
     """Blocks of the box around all nodes that points reach, a cell of slack on each side."""
     cell = torch.floor(torch.stack(torch.aminmax(position, dim=0)) / dx - 0.5)
     low, high = torch.floor((cell[0] - 1.0) / 4.0), torch.floor((cell[1] + 3.0) / 4.0)
-    return int((high - low + 1.0).prod())
+    return math.prod(int(n) for n in (high - low + 1.0).tolist())
 
 
 def _guarded(like: Tensor, make: Any) -> ops.Solver:

@@ -7,16 +7,22 @@ guide's space, new in every round, so that no border between two parts can be se
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.utils.rnn import pad_sequence
 
 from gsfluent.geometry import ascending
 
 _KNOTS = 65
 _COLOR_PARTS, _PARTITIONS, _ROTATIONS = 12, 3, 2  # parts of the guide's space for colours
 _PATCH_PARTS, _FILTERS = 6, 8  # the same for patches; directions per round and axis
+_AT_ONCE = {"cpu": 1 << 16}  # values of parts that are worked on together: as the cache is
+_AT_ONCE_ELSEWHERE = 1 << 23  # where launches cost more than memory
 _LEAST = 96  # samples a part of the guide's space must hold on both sides
 
 
@@ -50,32 +56,81 @@ class Cells:
         return torch.cat(parts)
 
 
-def _quantiles(values: Tensor, rng: np.random.Generator, limit: int = 4096) -> Tensor:
-    """Quantiles [K, D] of values [n, D], estimated from at most ``limit`` of them."""
-    if len(values) > limit:
-        pick = torch.from_numpy((rng.random(limit) * len(values)).astype(np.int64))
-        pick = pick.to(values.device)
-        values = values[pick]
-    ordered = ascending(values)
-    place = torch.linspace(0, len(ordered) - 1, _KNOTS, device=values.device)
-    low = place.floor().long().clamp(max=len(ordered) - 1)
-    high = (low + 1).clamp(max=len(ordered) - 1)
-    share = (place - low)[:, None]
-    return ordered[low] * (1 - share) + ordered[high] * share
+class _Parts:
+    """Rows that belong together, of all parts of the guide's space with enough on both sides.
+
+    Args:
+        own: Part of each value, int64 [n].
+        other: Part of each sample of the photographs, int64 [m].
+        count: Parts.
+    """
+
+    def __init__(self, own: Tensor, other: Tensor, count: int) -> None:
+        both = [torch.bincount(part, minlength=count) for part in (own, other)]
+        few, many = torch.stack(both).tolist()
+        enough = [min(pair) >= _LEAST for pair in zip(few, many, strict=True)]
+        self.rows = self._of(own, few, enough)
+        self.sources = self._of(other, many, enough)
+
+    @staticmethod
+    def _of(part: Tensor, sizes: list[int], enough: list[bool]) -> list[Tensor]:
+        rows = part.argsort(stable=True).split(sizes)
+        return [mine for mine, kept in zip(rows, enough, strict=True) if kept]
+
+    def together(self, device: torch.device) -> list[slice]:
+        """Parts that are worked on in one go."""
+        most = _AT_ONCE.get(device.type, _AT_ONCE_ELSEWHERE)
+        slices, first, longest = [], 0, 0
+        for k, (mine, source) in enumerate(zip(self.rows, self.sources, strict=True)):
+            size = max(len(mine), len(source))
+            if k > first and (k + 1 - first) * max(longest, size) > most:
+                slices.append(slice(first, k))
+                first, longest = k, 0
+            longest = max(longest, size)
+        return [*slices, slice(first, len(self.rows))] if self.rows else []
 
 
-def _shift(values: Tensor, have: Tensor, want: Tensor) -> Tensor:
-    """How far values [n, D] move when quantiles ``have`` become ``want`` (both [K, D])."""
-    knots = have.T.contiguous()
+def _drawn(size: int, rng: np.random.Generator, limit: int) -> np.ndarray | None:
+    """Which of many values stand for all; None for each of few."""
+    return (rng.random(limit) * size).astype(np.int64) if size > limit else None
+
+
+def _quantiles(values: list[Tensor], picks: Sequence[np.ndarray | None]) -> Tensor:
+    """Quantiles [P, K, D] of the values [n, D] of each part, or of those picked."""
+    device = values[0].device
+    some = [
+        each if pick is None else each[torch.from_numpy(pick).to(device)]
+        for each, pick in zip(values, picks, strict=True)
+    ]
+    ordered = pad_sequence(some, batch_first=True, padding_value=math.inf)
+    ordered = ascending(ordered.movedim(1, 0)).movedim(0, 1)
+    last = torch.tensor([len(each) - 1 for each in some], device=device)
+    place = torch.stack(
+        [torch.linspace(0, len(each) - 1, _KNOTS, device=device) for each in some]
+    )
+    low = place.floor().long().minimum(last[:, None])
+    high = (low + 1).minimum(last[:, None])
+    share = (place - low)[..., None]
+    low, high = (at[..., None].expand(-1, -1, ordered.shape[2]) for at in (low, high))
+    return ordered.gather(1, low) * (1 - share) + ordered.gather(1, high) * share
+
+
+def _shift(values: list[Tensor], have: Tensor, want: Tensor) -> list[Tensor]:
+    """How far the values [n, D] of each part move as quantiles ``have`` become ``want``.
+
+    Both are [P, K, D].
+    """
+    knots = have.mT.contiguous()
     # equal quantiles (flat colour) would make the inverse ambiguous
-    knots = knots + 1e-5 * torch.arange(_KNOTS, device=values.device)
-    moves = (want - have).T.contiguous()
-    at = values.T.contiguous()
+    knots = knots + 1e-5 * torch.arange(_KNOTS, device=knots.device)
+    moves = (want - have).mT.contiguous()
+    at = pad_sequence(values, batch_first=True).mT.contiguous()
     right = torch.searchsorted(knots, at).clamp_(1, _KNOTS - 1)
-    left_knot, right_knot = knots.gather(1, right - 1), knots.gather(1, right)
+    left_knot, right_knot = knots.gather(2, right - 1), knots.gather(2, right)
     share = ((at - left_knot) / (right_knot - left_knot)).clamp_(0.0, 1.0)
-    left, last = moves.gather(1, right - 1), moves.gather(1, right)
-    return (left + share * (last - left)).T
+    left, last = moves.gather(2, right - 1), moves.gather(2, right)
+    moved = (left + share * (last - left)).mT
+    return [mine[: len(each)] for mine, each in zip(moved, values, strict=True)]
 
 
 def match_near(
@@ -94,21 +149,35 @@ def match_near(
     repeats = 1 if single else _PARTITIONS
     for _ in range(repeats):
         cells = Cells(reference_guide, _COLOR_PARTS, rng)
-        own, other = cells.of(guide), cells.of(reference_guide)
+        parts = _Parts(cells.of(guide), cells.of(reference_guide), len(cells.centers))
+        draws = [
+            [
+                (
+                    np.linalg.qr(rng.standard_normal((3, 3)))[0],
+                    _drawn(len(mine), rng, 16384),
+                    _drawn(len(source), rng, 16384),
+                )
+                for _ in range(_ROTATIONS)
+            ]
+            for mine, source in zip(parts.rows, parts.sources, strict=True)
+        ]
         moved = values.clone()
-        for k in range(len(cells.centers)):
-            chosen = (own == k).nonzero()[:, 0]
-            source = reference[other == k]
-            if len(chosen) < _LEAST or len(source) < _LEAST:
-                continue
-            part = moved[chosen]
-            for _ in range(_ROTATIONS):
-                basis = torch.from_numpy(np.linalg.qr(rng.standard_normal((3, 3)))[0]).to(values)
-                turned = part @ basis
-                have = _quantiles(turned, rng, 16384)
-                want = _quantiles(source @ basis, rng, 16384)
-                part = part + _shift(turned, have, want) @ basis.T
-            moved[chosen] = part
+        for some in parts.together(values.device):
+            rows, part = parts.rows[some], [values[mine] for mine in parts.rows[some]]
+            sources = [reference[source] for source in parts.sources[some]]
+            for drawn in zip(*draws[some], strict=True):
+                matrices, own_picks, other_picks = zip(*drawn, strict=True)
+                bases = torch.from_numpy(np.stack(matrices)).to(values)
+                turned = [each @ basis for each, basis in zip(part, bases, strict=True)]
+                goal = [each @ basis for each, basis in zip(sources, bases, strict=True)]
+                have, want = _quantiles(turned, own_picks), _quantiles(goal, other_picks)
+                part = [
+                    each + shift @ basis.T
+                    for each, shift, basis in zip(
+                        part, _shift(turned, have, want), bases, strict=True
+                    )
+                ]
+            moved[torch.cat(rows)] = torch.cat(part)
         total += moved
     return total / repeats
 
@@ -163,16 +232,19 @@ def polish_patches(
             flat = responses.permute(1, 0, 2, 3).reshape(filters, -1)[:, position].T
             own_guide = guide.movedim(axis + 1, 1).reshape(len(guide), -1)
             own = cells.of(own_guide[:, position].T.contiguous())
-            other = cells.of(patch_guide)
+            parts = _Parts(own, cells.of(patch_guide), len(cells.centers))
+            picks = [
+                (_drawn(len(mine), rng, 4096), _drawn(len(source), rng, 4096))
+                for mine, source in zip(parts.rows, parts.sources, strict=True)
+            ]
             reference = patches @ kernel
             moves = torch.zeros_like(flat)
-            for k in range(len(cells.centers)):
-                chosen = (own == k).nonzero()[:, 0]
-                source = reference[other == k]
-                if len(chosen) < _LEAST or len(source) < _LEAST:
-                    continue
-                part = flat[chosen]
-                moves[chosen] = _shift(part, _quantiles(part, rng), _quantiles(source, rng))
+            for some in parts.together(flat.device):
+                own_picks, other_picks = zip(*picks[some], strict=True)
+                part = [flat[mine] for mine in parts.rows[some]]
+                goal = [reference[source] for source in parts.sources[some]]
+                have, want = _quantiles(part, own_picks), _quantiles(goal, other_picks)
+                moves[torch.cat(parts.rows[some])] = torch.cat(_shift(part, have, want))
             spread = torch.zeros(filters, mask.numel(), device=volume.device)
             spread[:, position] = moves.T
             spread = spread.reshape(filters, *mask.shape).permute(1, 0, 2, 3)
