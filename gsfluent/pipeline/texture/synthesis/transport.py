@@ -105,9 +105,7 @@ def _quantiles(values: list[Tensor], picks: Sequence[np.ndarray | None]) -> Tens
     ordered = pad_sequence(some, batch_first=True, padding_value=math.inf)
     ordered = ascending(ordered.movedim(1, 0)).movedim(0, 1)
     last = torch.tensor([len(each) - 1 for each in some], device=device)
-    place = torch.stack(
-        [torch.linspace(0, len(each) - 1, _KNOTS, device=device) for each in some]
-    )
+    place = torch.stack([torch.linspace(0, len(each) - 1, _KNOTS, device=device) for each in some])
     low = place.floor().long().minimum(last[:, None])
     high = (low + 1).minimum(last[:, None])
     share = (place - low)[..., None]
