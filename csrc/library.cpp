@@ -80,6 +80,12 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def(
       "carry_axes(Tensor quats, Tensor scales, Tensor map, Tensor rotation, float rigid) -> "
       "(Tensor, Tensor)");
+  m.def(
+      "cut_at_cells(Tensor means, Tensor quats, Tensor scales, Tensor owner, Tensor near, "
+      "Tensor opened, Tensor rest, float slack) -> (Tensor, Tensor, Tensor, Tensor)");
+  m.def(
+      "cut_by_planes(Tensor means, Tensor whole, Tensor covariance, Tensor first, Tensor normal, "
+      "Tensor distance, Tensor share) -> (Tensor, Tensor, Tensor)");
 
   // --- mvee: minimum-volume enclosing ellipsoids ---
   m.def("mvee(Tensor points, float tolerance, int max_iterations) -> (Tensor, Tensor)");

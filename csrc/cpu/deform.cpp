@@ -4,6 +4,7 @@
 #include <algorithm>
 
 #include "core/deform/carry.h"
+#include "core/deform/cut.h"
 #include "cpu/svd.h"
 
 namespace gsf {
@@ -83,6 +84,18 @@ struct DeformCpu {
   static void carry_place(const CarryPlaceArgs<T>& a, const Scope&) {
     parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::carry_place(a, i);
+    });
+  }
+  template <typename T>
+  static void cut_at_cells(const CutAtCellsArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::cut_at_cells(a, i);
+    });
+  }
+  template <typename T>
+  static void cut_by_planes(const CutByPlanesArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::cut_by_planes(a, i);
     });
   }
   template <typename T>

@@ -96,11 +96,92 @@ struct DeformOps {
     return {new_quats, new_scales};
   }
 
+  static std::tuple<Tensor, Tensor, Tensor, Tensor> cut_at_cells(Tensor means, Tensor quats,
+                                                                 Tensor scales, Tensor owner,
+                                                                 Tensor near, Tensor opened,
+                                                                 Tensor rest, double slack) {
+    const char* op = "cut_at_cells";
+    means = ready(op, "means", means, means, {-1, 3});
+    const int64_t count = means.size(0);
+    quats = ready(op, "quats", quats, means, {count, 4});
+    scales = ready(op, "scales", scales, means, {count, 3});
+    rest = ready(op, "rest", rest, means, {-1, 3});
+    const int64_t points = rest.size(0);
+    owner = ready(op, "owner", owner, means, {count}, ScalarType::Long);
+    near = ready(op, "near", near, means, {points, -1}, ScalarType::Long);
+    const int64_t k = near.size(1);
+    opened = ready(op, "opened", opened, means, {points, k}, ScalarType::Bool);
+    Tensor cut = gsf::new_empty(means, {count}, ScalarType::Bool);
+    Tensor new_means = gsf::new_empty(means, {count, 3}, means.scalar_type());
+    Tensor new_quats = gsf::new_empty(means, {count, 4}, means.scalar_type());
+    Tensor new_scales = gsf::new_empty(means, {count, 3}, means.scalar_type());
+    const typename Backend::Scope scope(means);
+    dispatch_floating(op, means, [&]<typename T>() {
+      if (count == 0) return;
+      const CutAtCellsArgs<T> args{count,
+                                   points,
+                                   static_cast<int>(k),
+                                   cptr<T>(means),
+                                   cptr<T>(quats),
+                                   cptr<T>(scales),
+                                   cptr<int64_t>(owner),
+                                   cptr<int64_t>(near),
+                                   cptr<bool>(opened),
+                                   cptr<T>(rest),
+                                   T(slack),
+                                   mptr<bool>(cut),
+                                   mptr<T>(new_means),
+                                   mptr<T>(new_quats),
+                                   mptr<T>(new_scales)};
+      Backend::cut_at_cells(args, scope);
+    });
+    return {cut, new_means, new_quats, new_scales};
+  }
+
+  static std::tuple<Tensor, Tensor, Tensor> cut_by_planes(Tensor means, Tensor whole,
+                                                          Tensor covariance, Tensor first,
+                                                          Tensor normal, Tensor distance,
+                                                          Tensor share) {
+    const char* op = "cut_by_planes";
+    means = ready(op, "means", means, means, {-1, 3});
+    const int64_t count = means.size(0);
+    whole = ready(op, "whole", whole, means, {count, 3});
+    covariance = ready(op, "covariance", covariance, means, {count, 6});
+    first = ready(op, "first", first, means, {count + 1}, ScalarType::Long);
+    normal = ready(op, "normal", normal, means, {-1, 3});
+    const int64_t planes = normal.size(0);
+    distance = ready(op, "distance", distance, means, {planes});
+    share = ready(op, "share", share, means, {planes});
+    Tensor new_means = gsf::new_empty(means, {count, 3}, means.scalar_type());
+    Tensor quats = gsf::new_empty(means, {count, 4}, means.scalar_type());
+    Tensor scales = gsf::new_empty(means, {count, 3}, means.scalar_type());
+    const typename Backend::Scope scope(means);
+    dispatch_floating(op, means, [&]<typename T>() {
+      if (count == 0) return;
+      const CutByPlanesArgs<T> args{count,
+                                    planes,
+                                    cptr<T>(means),
+                                    cptr<T>(whole),
+                                    cptr<T>(covariance),
+                                    cptr<int64_t>(first),
+                                    cptr<T>(normal),
+                                    cptr<T>(distance),
+                                    cptr<T>(share),
+                                    mptr<T>(new_means),
+                                    mptr<T>(quats),
+                                    mptr<T>(scales)};
+      Backend::cut_by_planes(args, scope);
+    });
+    return {new_means, quats, scales};
+  }
+
   static void register_all(Library& m) {
     GSF_IMPL(DeformOps, polar_clamped);
     GSF_IMPL(DeformOps, covariance_axes);
     GSF_IMPL(DeformOps, carry_place);
     GSF_IMPL(DeformOps, carry_axes);
+    GSF_IMPL(DeformOps, cut_at_cells);
+    GSF_IMPL(DeformOps, cut_by_planes);
   }
 };
 

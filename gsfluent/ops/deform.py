@@ -155,6 +155,107 @@ def carry_place(
     return means, blend
 
 
+def cut_at_cells(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    *,
+    owner: Tensor,
+    near: Tensor,
+    opened: Tensor,
+    rest: Tensor,
+    slack: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Gaussians cut where the cells of their own points border on points that moved away.
+
+    A face lies halfway between a splat's point and such a neighbour. It cuts a splat that reaches
+    within two standard deviations of it, unless a third point's cell begins there. What is left has
+    the mean and the variance of the part on the near side: with ``t`` the distance of the face in
+    standard deviations and ``h = phi(t) / Phi(t)``, ``mean' = mean - h S n / s`` and
+    ``S' = S - (t h + h^2) (S n)(S n)^T / s^2``, ``s^2 = n^T S n``.
+
+    Args:
+        means: Centres [m], shape [M, 3], float32 or float64.
+        quats: Orientations, wxyz, [M, 4].
+        scales: Standard deviations [m], [M, 3].
+        owner: Point of each, int64 [M].
+        near: Neighbours of every point, int64 [N, K].
+        opened: Which of them have moved away, bool [N, K].
+        rest: Points at rest [m], [N, 3].
+        slack: Standard deviations by which cuts stay outside of the faces.
+
+    Returns:
+        Which were cut, bool [M], and all means, quats and scales.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none.
+    """
+    op = "cut_at_cells"
+    check_tensor(op, "means", means, shape=("M", 3))
+    count = means.shape[0]
+    check_tensor(op, "quats", quats, shape=(count, 4), like=means)
+    check_tensor(op, "scales", scales, shape=(count, 3), like=means)
+    check_tensor(op, "rest", rest, shape=("N", 3), like=means)
+    points = rest.shape[0]
+    check_tensor(op, "owner", owner, shape=(count,), dtype=torch.int64, like=means)
+    check_tensor(op, "near", near, shape=(points, "K"), dtype=torch.int64, like=means)
+    check_tensor(op, "opened", opened, shape=near.shape, dtype=torch.bool, like=means)
+    cut, new_means, new_quats, new_scales = torch.ops.gsfluent.cut_at_cells.default(
+        means, quats, scales, owner, near, opened, rest, float(slack)
+    )
+    return cut, new_means, new_quats, new_scales
+
+
+def cut_by_planes(
+    means: Tensor,
+    covariance: Tensor,
+    *,
+    first: Tensor,
+    normal: Tensor,
+    distance: Tensor,
+    share: Tensor | None = None,
+    whole: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Parts of Gaussians below planes, one plane after another; see :func:`cut_at_cells`.
+
+    Args:
+        means: Centres [m], shape [N, 3], float32 or float64.
+        covariance: Packed xx, yy, zz, xy, xz, yz [m^2], [N, 6].
+        first: First plane of each and the end of the last, ascending, int64 [N + 1].
+        normal: Unit vectors to the planes, [P, 3].
+        distance: Distances of the planes along them [m], [P]; infinite for none.
+        share: How far each cuts, 0 to 1, [P]; all the way when absent.
+        whole: Where the distances count from [m], [N, 3]; the means when absent.
+
+    Returns:
+        Means [N, 3], quats wxyz [N, 4] and scales [m] [N, 3].
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none.
+    """
+    op = "cut_by_planes"
+    check_tensor(op, "means", means, shape=("N", 3))
+    count = means.shape[0]
+    check_tensor(op, "covariance", covariance, shape=(count, 6), like=means)
+    check_tensor(op, "first", first, shape=(count + 1,), dtype=torch.int64, like=means)
+    check_tensor(op, "normal", normal, shape=("P", 3), like=means)
+    share = torch.ones_like(distance) if share is None else share
+    whole = means if whole is None else whole
+    for name, value in (("distance", distance), ("share", share)):
+        check_tensor(op, name, value, shape=(normal.shape[0],), like=means)
+    check_tensor(op, "whole", whole, shape=(count, 3), like=means)
+    new_means, quats, scales = torch.ops.gsfluent.cut_by_planes.default(
+        means, whole, covariance, first, normal, distance, share
+    )
+    return new_means, quats, scales
+
+
 def _like_both(a: Tensor, b: Tensor, *rest: object) -> tuple[Tensor, Tensor]:
     return a.new_empty(a.shape), b.new_empty(b.shape)
 
@@ -164,6 +265,14 @@ fakes(
     covariance_axes=lambda c: (c.new_empty((len(c), 4)), c.new_empty((len(c), 3))),
     carry_axes=_like_both,
     carry_place=lambda p, *rest: (p.new_empty(p.shape), p.new_empty((len(p), 3, 3))),
+    cut_at_cells=lambda m, q, s, owner, *rest: (
+        owner.new_empty(owner.shape, dtype=torch.bool),
+        *(v.new_empty(v.shape) for v in (m, q, s)),
+    ),
+    cut_by_planes=lambda m, *rest: tuple(m.new_empty((len(m), n)) for n in (3, 4, 3)),
 )
 no_gradient("polar_clamped: no gradient with respect to deformation", "polar_clamped")
-no_gradient("axes of Gaussians: no gradient", "carry_place", "covariance_axes", "carry_axes")
+no_gradient(
+    "axes of Gaussians: no gradient", "carry_place", "covariance_axes", "carry_axes",
+    "cut_at_cells", "cut_by_planes",
+)  # fmt: skip

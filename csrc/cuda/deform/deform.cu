@@ -1,5 +1,6 @@
 // CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
 #include "core/deform/carry.h"
+#include "core/deform/cut.h"
 #include "cuda/deform/launch.h"
 #include "cuda/threads.h"
 
@@ -34,6 +35,18 @@ __global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
   if (i < a.count) gsf::carry_axes(a, i);
 }
 
+template <typename T>
+__global__ void cut_at_cells_kernel(CutAtCellsArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::cut_at_cells(a, i);
+}
+
+template <typename T>
+__global__ void cut_by_planes_kernel(CutByPlanesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::cut_by_planes(a, i);
+}
+
 template <typename Args, typename Kernel>
 cudaError_t launch(const Args& args, cudaStream_t stream, Kernel kernel) {
   if (args.count == 0) return cudaSuccess;
@@ -59,6 +72,14 @@ template <typename T>
 cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, carry_axes_kernel<T>);
 }
+template <typename T>
+cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, cut_at_cells_kernel<T>);
+}
+template <typename T>
+cudaError_t cut_by_planes(const CutByPlanesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, cut_by_planes_kernel<T>);
+}
 
 template cudaError_t polar_clamped(const PolarArgs<float>&, cudaStream_t);
 template cudaError_t polar_clamped(const PolarArgs<double>&, cudaStream_t);
@@ -68,5 +89,9 @@ template cudaError_t carry_place(const CarryPlaceArgs<float>&, cudaStream_t);
 template cudaError_t carry_place(const CarryPlaceArgs<double>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<float>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<double>&, cudaStream_t);
+template cudaError_t cut_at_cells(const CutAtCellsArgs<float>&, cudaStream_t);
+template cudaError_t cut_at_cells(const CutAtCellsArgs<double>&, cudaStream_t);
+template cudaError_t cut_by_planes(const CutByPlanesArgs<float>&, cudaStream_t);
+template cudaError_t cut_by_planes(const CutByPlanesArgs<double>&, cudaStream_t);
 
 }  // namespace gsf::cuda

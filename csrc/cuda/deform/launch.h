@@ -19,4 +19,10 @@ cudaError_t carry_place(const CarryPlaceArgs<T>& args, cudaStream_t stream);
 template <typename T>
 cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream);
 
+template <typename T>
+cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t cut_by_planes(const CutByPlanesArgs<T>& args, cudaStream_t stream);
+
 }  // namespace gsf::cuda

@@ -12,6 +12,8 @@ struct DeformCuda {
   GSF_LAUNCH(covariance_axes)
   GSF_LAUNCH(carry_place)
   GSF_LAUNCH(carry_axes)
+  GSF_LAUNCH(cut_at_cells)
+  GSF_LAUNCH(cut_by_planes)
 };
 
 }  // namespace

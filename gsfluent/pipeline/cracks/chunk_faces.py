@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import Gaussians, Solid
-from gsfluent.pipeline.cracks.cuts import REACH, cut_at
+from gsfluent.pipeline.cracks.cuts import REACH
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
 from gsfluent.pipeline.partition.splits import Split, Splits
 from gsfluent.pipeline.partition.tree import Partition
@@ -196,8 +196,11 @@ def _elements(
     size = torch.tensor([WIDTH, WIDTH, THICKNESS], device=means.device) * edge
     root = axes * size
     covariance = root @ root.mT
-    means, covariance = cut_at(means, covariance, *plane)
-    quats, scales = ops.covariance_axes(geometry.pack_symmetric(covariance))
+    way, off = plane
+    means, quats, scales = ops.cut_by_planes(
+        means, geometry.pack_symmetric(covariance), normal=way, distance=off,
+        first=torch.arange(len(means) + 1, device=means.device),
+    )  # fmt: skip
     none = torch.full_like(voxel, -1)
     return ChunkFaces(
         key=(number << _NUMBER) + (voxel << 1) + kind, voxel=voxel, region=region, beyond=beyond,

@@ -30,7 +30,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
     find_faces,
     wide_cuts,
 )
-from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
+from gsfluent.pipeline.cracks.cuts import cut_in_part
 from gsfluent.pipeline.cracks.dust import Dust
 from gsfluent.pipeline.cracks.followers import (
     WIDE,
@@ -523,12 +523,10 @@ class Chunks:
             _, _, share = self._gap(carry, points, whole[rows], carry.owner[rows], cuts.rival)
             share = self._opened(share, cuts.rival)
             open_ = (share > 0.0).nonzero()[:, 0]
-            for turn in in_turns(rows[open_]):
-                which = open_[turn]
-                means, quats, scales = cut_in_part(
-                    (means, quats, scales), whole, cuts.splat[which], cuts.normal[which],
-                    cuts.distance[which], share[which, None],
-                )  # fmt: skip
+            means, quats, scales = cut_in_part(
+                (means, quats, scales), whole, rows[open_], cuts.normal[open_],
+                cuts.distance[open_], share[open_],
+            )  # fmt: skip
         rest = rest.replace(means=means, quats=quats, scales=scales)
         if self._dust.rows.numel() == 0:
             return rest

@@ -17,7 +17,6 @@ from torch import Tensor
 from gsfluent import geometry, ops
 from gsfluent.data import TRANSITION, Gaussians
 from gsfluent.errors import InputError
-from gsfluent.pipeline.cracks.cuts import cut_splats
 from gsfluent.pipeline.cracks.faces import DEBRIS, PIECE, Elements, Fit, find_elements
 from gsfluent.pipeline.cracks.sites import Sites
 from gsfluent.pipeline.matter.carry import Carry, Points
@@ -156,15 +155,15 @@ class Gaps:
         carry, links = self.carry, self.carry.links
         whole, rest = carry.gaussians, self._rest
         stale = changed[carry.owner].nonzero()[:, 0]
-        means, quats, scales = rest.means.clone(), rest.quats.clone(), rest.scales.clone()
-        for rows in stale.split(CHUNK):
-            shape = whole.means[rows], whole.quats[rows], whole.scales[rows]
-            cut, *now = cut_splats(
-                *shape, owner=carry.owner[rows], near=links.near, opened=self._opened,
-                rest=links.rest, slack=SLACK,
-            )  # fmt: skip
-            for value, before, after in zip((means, quats, scales), shape, now, strict=True):
-                value[rows] = before.index_copy(0, cut, after)
+        shape = whole.means[stale], whole.quats[stale], whole.scales[stale]
+        _, *now = ops.cut_at_cells(
+            *shape, owner=carry.owner[stale], near=links.near, opened=self._opened,
+            rest=links.rest, slack=SLACK,
+        )  # fmt: skip
+        means, quats, scales = (
+            before.index_copy(0, stale, after)
+            for before, after in zip((rest.means, rest.quats, rest.scales), now, strict=True)
+        )
         self._rest = rest.replace(means=means, quats=quats, scales=scales)
 
     def _open(self, changed: Tensor) -> None:
@@ -179,7 +178,8 @@ class Gaps:
         debris = self._debris[self._sites.owner]
         for fit, which in ((PIECE, ~debris), (DEBRIS, debris)):
             for rows in (stale & which).nonzero()[:, 0].split(CHUNK):
-                parts.append(self._found(rows, fit))
+                if rows.numel():
+                    parts.append(self._found(rows, fit))
         self._elements = Elements.sorted(parts) if parts else None
 
     def _found(self, rows: Tensor, fit: Fit) -> Elements:
@@ -187,16 +187,11 @@ class Gaps:
         links = self.carry.links
         assert self._sites is not None  # _open sees to it
         found = find_elements(self._sites, rows, links.rest, links.near, self._opened, fit)
-        cut, means, quats, scales = cut_splats(
+        _, means, quats, scales = ops.cut_at_cells(
             found.means, found.quats, found.scales, owner=found.owner, near=links.near,
             opened=self._opened, rest=links.rest, slack=fit.slack,
         )  # fmt: skip
-        return dataclasses.replace(
-            found,
-            means=found.means.index_copy(0, cut, means),
-            quats=found.quats.index_copy(0, cut, quats),
-            scales=found.scales.index_copy(0, cut, scales),
-        )
+        return dataclasses.replace(found, means=means, quats=quats, scales=scales)
 
 
 def _births(elements: Elements, carry: Carry, points: Points) -> Births:

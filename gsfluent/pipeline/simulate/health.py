@@ -23,7 +23,7 @@ from gsfluent.pipeline.simulate.step import Stepper
 
 _log = logging.getLogger(__name__)
 
-CHECK_EVERY = 64
+CHECK_EVERY = 128
 """Grid steps between two checks."""
 VOLUME_RATIO = (0.02, 50.0)
 """Bounds of the volume ratio J; the return map's own guard keeps J inside [0.05, 20]."""

@@ -33,10 +33,10 @@ from gsfluent.scene.scene import Scene
 
 MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
-REGROUP = 64
+REGROUP = 128
 """Grid steps between two looks for new pieces within a frame."""
-RARELY, MANY = 192, 2000
-"""Such a look is due when a 2000th of the points has broken since the last one, or after 192 steps
+RARELY, MANY = 384, 500
+"""Such a look is due when a 500th of the points has broken since the last one, or after 384 steps
 when any has: on a GPU a look takes as long as a hundred steps, and what few points hold together
 can wait."""
 MOVED = 0.25

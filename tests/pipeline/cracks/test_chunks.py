@@ -18,7 +18,6 @@ from gsfluent.pipeline.cracks.chunk_faces import (
     wide_cuts,
 )
 from gsfluent.pipeline.cracks.chunks import OPACITY
-from gsfluent.pipeline.cracks.cuts import in_turns
 from gsfluent.pipeline.cracks.stage import Repair, Repaired
 from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.points import body_frame, build_matter
@@ -398,9 +397,3 @@ def test_a_splat_wider_than_its_points_is_cut_from_afar() -> None:
     assert float(cuts.distance) == pytest.approx(0.02, rel=1e-4)
     again = wide_cuts(splats, torch.arange(4), region, cuts, faces, 0.004)
     assert again.splat.tolist() == [0]
-
-
-def test_what_is_cut_more_than_once_is_cut_in_turns() -> None:
-    turns = [turn.tolist() for turn in in_turns(torch.tensor([4, 9, 4, 4, 1, 9]))]
-    assert turns == [[0, 1, 4], [2, 5], [3]]
-    assert in_turns(torch.zeros(0, dtype=torch.int64)) == []

@@ -10,7 +10,7 @@ from simulation_shapes import ellipsoid
 
 from gsfluent import geometry, materials, ops
 from gsfluent.data import Frame
-from gsfluent.pipeline.cracks.cuts import cut_at
+from gsfluent.ops.reference.deform import cut_at
 from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 from gsfluent.pipeline.matter.points import build_matter
 from gsfluent.scene.scene import Scene
