@@ -69,6 +69,11 @@ def calls() -> dict[str, Call]:
         lib.mvee(torch.randn(3, 9, 3), 1e-2, 100)
         lib.polar_clamped(torch.randn(9, 3, 3), 0.5, 2.0)
         lib.covariance_axes(torch.rand(9, 6))
+        near, opened = torch.randint(0, 7, (7, 4)), torch.rand(7, 4) < 0.5
+        splat = (torch.randn(9, 3), torch.randn(9, 4), torch.rand(9, 3))
+        lib.cut_at_cells(*splat, torch.randint(0, 7, (9,)), near, opened, torch.randn(7, 3), 0.1)
+        planes = (torch.randn(12, 3), torch.randn(12), torch.rand(12))
+        lib.cut_by_planes(splat[0], splat[0], torch.rand(9, 6), torch.arange(10), *planes)
         lib.splat_bulk(torch.rand(50, 3), torch.rand(50, 3))
         picture = torch.rand(32, 32, 3)
         lib.ssim(picture, picture.flip(1), True)
@@ -78,7 +83,7 @@ def calls() -> dict[str, Call]:
 NAMES = (
     "build_blocks p2g grid_update g2p p2g_adjoint transfer_slope return_mapping "
     "return_mapping_adjoint rasterize rasterize_backward collider_distance advance_colliders mvee "
-    "polar_clamped covariance_axes splat_bulk ssim"
+    "polar_clamped covariance_axes cut_at_cells cut_by_planes splat_bulk ssim"
 ).split()
 
 
