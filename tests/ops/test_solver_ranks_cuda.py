@@ -111,7 +111,7 @@ def test_order_of_points_and_room_for_blocks_leave_no_trace() -> None:
     assert torch.equal(several.impulse, one.impulse)
     tight = ops.Solver(**here(given), ranks=3)
     homes = int(tight.clock()["homes"])
-    tight._buffers.reserve_blocks(homes, 1, 2)
+    tight._whole.reserve_blocks(homes, 1, 2)
     tight._parts.grow()
     start = tight.snapshot()
     for _ in range(2):
