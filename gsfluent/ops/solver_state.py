@@ -279,7 +279,7 @@ class SolverState:
         for index, values in self.chunks(name):
             if out is None:
                 out = values.new_empty((self.count, *values.shape[1:]), device=self.outside)
-            out.index_copy_(0, index.to(out.device), values.to(out.device))
+            out[index.to(out.device)] = values.to(out.device)
         assert out is not None  # there is a point
         return out
 
