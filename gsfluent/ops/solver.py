@@ -224,7 +224,7 @@ class Solver(SolverState):
         self.dx = check_dx(op, dx)
         self._surface(radius, like, self.dx, cfl)
         self.outside, self.dtype, self.count = velocity.device, velocity.dtype, n
-        self.devices = None if devices is None else check_devices(devices, self.outside)
+        self.devices = [] if devices is None else check_devices(devices, self.outside)
         self.device = self.devices[0] if self.devices and not velocity.is_cuda else self.outside
         self.gravity = tuple(float(g) for g in gravity)
         if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
@@ -368,7 +368,7 @@ class Solver(SolverState):
 
     def _ranks(self, ranks: int) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
-        if self.devices is not None:
+        if self.devices:
             if ranks not in (1, len(self.devices)):
                 raise InputError(
                     f"Solver: {ranks} ranks on {len(self.devices)} devices",

@@ -203,7 +203,8 @@ class Buffers:
 def groups(values: Tensor, width: int) -> Iterator[Tensor]:
     """Views [N, components] of ``width`` components per point, as they lie in memory.
 
-    Rows on a CPU; on a device planes of up to four components, flat (``csrc/core/solver/layout.h``).
+    Rows on a CPU; on a device flat, planes of up to four components each
+    (``csrc/core/solver/layout.h``).
     """
     if values.dim() == 2:
         yield values

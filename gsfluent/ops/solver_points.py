@@ -91,9 +91,7 @@ class Given:
         def of(name: str) -> Tensor:
             value = self.more.get(name)
             if value is None:
-                return torch.zeros(
-                    len(row), layout.ON_CPU.get(name, 9), dtype=real, device=device
-                )
+                return torch.zeros(len(row), layout.ON_CPU.get(name, 9), dtype=real, device=device)
             return finite(name, value[part].to(device).reshape(len(row), -1))
 
         velocity = self.velocity[part].to(device)
@@ -141,7 +139,8 @@ def load(
         b: Buffers without points yet.
         widths: What they hold of each.
         given: All points.
-        begin, end: The stretch.
+        begin: Its first point.
+        end: Past its last one.
         room: So many points there is to be room for.
 
     Returns:

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
-from gsfluent.materials.phase_field import MODELS
 from gsfluent.errors import InputError
+from gsfluent.materials.phase_field import MODELS
 from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops import solver_points as points
 from gsfluent.ops.plasticity import LAWS, SLOW_UNLOADING, return_mapping, weakened
@@ -128,13 +128,13 @@ class SolverState:
             check_tensor("Solver", "material", material, shape=(self.count,), dtype=torch.int32)
             if not bool(((material >= 0) & (material < count)).all()):
                 raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
-        found = []
+        found: list[Tensor] = []
         row = torch.empty(self.count, dtype=torch.int32, device=self.outside)
         for part in points.stretches(0, self.count):
             facts = [mass.new_zeros(()).expand_as(mass)] if material is None else [material]
             facts = [fact[part].to(self.device, torch.float64) for fact in (*facts, mass, volume)]
             unique, index = _unique_rows(torch.stack(facts, dim=1))
-            row[part] = index.to(row) + sum(len(rows) for rows in found)
+            row[part] = index.to(row) + sum(map(len, found))
             found.append(unique)
         if len(found) > 1:
             unique, number = _unique_rows(torch.cat(found))
@@ -178,7 +178,9 @@ class SolverState:
         share = -(-n // len(stores))
         room = self._parts.room(share) if self._parts else n
         found = [
-            points.load(store, self._widths, given, min(r * share, n), min((r + 1) * share, n), room)
+            points.load(
+                store, self._widths, given, min(r * share, n), min((r + 1) * share, n), room
+            )
             for r, store in enumerate(stores)
         ]
         key = torch.unique(torch.cat([own.to(self.device) for own, _ in found]))

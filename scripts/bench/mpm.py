@@ -80,9 +80,7 @@ def points(n: int, cells: int, order: str, device: torch.device) -> tuple[Tensor
     return x.to(device), dx
 
 
-def build(
-    n: int, cells: int, order: str, kind: str, device: torch.device
-) -> ops.Solver:
+def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> ops.Solver:
     x, dx = points(n, cells, order, device)
     count = x.shape[0]
     young, nu = 1e5, 0.3
@@ -265,8 +263,8 @@ def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
     lines = [
         f"Device: {name}; torch {torch.__version__}. Elastic, lattice. Whole steps, with builds.",
         "",
-        "| points | devices | ms | times the first | bits of the first | shared blocks | loading [s] "
-        "| most memory of one [GB] |",
+        "| points | devices | ms | times the first | bits of the first | shared blocks | "
+        "loading [s] | most memory of one [GB] |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     lines += [

@@ -405,7 +405,7 @@ def test_each_device_gets_a_stretch_of_points_from_host_memory(
     solver._parts = parts
     more = {name: given[name] for name in ("strain", "alpha", "viscous", "peak", "deformation")
             if given.get(name) is not None}  # fmt: skip
-    rows = ((want._rows(given.get("material"), given["mass"], given["volume"])))[0]
+    rows = (want._rows(given.get("material"), given["mass"], given["volume"]))[0]
     solver._load(solver_points.Given(
         given["position"], given["velocity"], given["mass"], rows, given.get("body"), more,
         solver.frame, solver.dx,
