@@ -154,7 +154,9 @@ class Solver(SolverState):
             each other what they share (docs/theory/ranks.md): the same bits for any number. In
             lockstep on one device, which is slower than 1; the rehearsal for several. 1 to 64.
         devices: CUDA devices of one host, as in ``["cuda:0", "cuda:1"]``: one rank on each. That of
-            ``position`` and the others is among them. Default: all ranks where the points lie.
+            ``position`` and the others is among them, or these lie in host memory, where they need
+            not fit into a device, and what is read of the state goes there. Default: all ranks
+            where the points lie.
 
     Raises:
         TypeError: Wrong type or dtype.
