@@ -334,7 +334,8 @@ GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
 // `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
-// kKeeps: with keep_own, and `before` holds what leave_share left.
+// kTrack: with the deformation, where there is one. kKeeps: with keep_own, and `before` holds what
+// leave_share left.
 template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
                                           ParticleBefore<T>& before, uint32_t reach, const T* value,
@@ -356,7 +357,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   }
   store_place(s, p, o, pack_meta(l[0], l[1], l[2], meta_row(meta)));
 
-  if constexpr (kTrack) {
+  if (kTrack && s.deformation != nullptr) {
     Mat3<T> f;
     load_nine(s, s.deformation, p, f.m);
     f = f + dt * matmul(c, f);
