@@ -5,6 +5,7 @@ python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md 
 python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
 python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136
+python scripts/bench/mpm.py --measured a.json b.json --markdown docs/measured/benchmarks.md
 
 With --profile too: what each GPU does in a step, kernel by kernel.
 With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the
@@ -259,9 +260,9 @@ def profile(n: int, cells: int, count: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
+def scaling_table(name: str, rows: list[dict[str, Any]], torch_name: str) -> str:
     lines = [
-        f"Device: {name}; torch {torch.__version__}. Elastic, lattice. Whole steps, with builds.",
+        f"Device: {name}; torch {torch_name}. Elastic, lattice. Whole steps, with builds.",
         "",
         "| points | devices | ms | times the first | bits of the first | shared blocks | "
         "loading [s] | most memory of one [GB] |",
@@ -317,12 +318,19 @@ def main() -> int:
     parser.add_argument("--peer", type=Path, help="what physgaussian.py wrote")
     parser.add_argument("--devices", nargs="*", type=int, help="numbers of GPUs: 1 2 4")
     parser.add_argument("--profile", action="store_true", help="with --devices: kernel by kernel")
+    parser.add_argument("--measured", type=Path, nargs="*", help="--json of --devices: only enter")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     if options.peer:
         for row in json.loads(options.peer.read_text())["rows"]:
             PEER[row["grid"], row["cells"], row["order"]] = round(row["ms"], 3)
+    if options.measured:
+        found = [json.loads(path.read_text()) for path in options.measured]
+        rows = [row for one in found for row in one["rows"]]
+        name, torch_name = found[0]["device"], found[0].get("torch", torch.__version__)
+        table = scaling_table(name, rows, torch_name)
+        return leave(options, "bench_mpm devices", table, name, rows)
     if options.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
     gpu = options.device == "cuda" or (options.device == "auto" and has_cuda())
@@ -343,7 +351,8 @@ def main() -> int:
         if options.profile:
             return 0
         name = torch.cuda.get_device_name()
-        return leave(options, "bench_mpm devices", scaling_table(name, rows), name, rows)
+        table = scaling_table(name, rows, torch.__version__)
+        return leave(options, "bench_mpm devices", table, name, rows)
     default = ["100:24", "200:50", "200:80", "300:100"] if gpu else ["100:24"]
     rows = []
     for text in options.rows or default:
@@ -371,7 +380,9 @@ def leave(
     """Print the table; write it and the rows to where they were asked for."""
     sys.stdout.write(text)
     if options.json:
-        options.json.write_text(json.dumps({"device": name, "rows": rows}, indent=1) + "\n")
+        options.json.write_text(
+            json.dumps({"device": name, "torch": torch.__version__, "rows": rows}, indent=1) + "\n"
+        )
     if options.markdown:
         page = options.markdown
         old = page.read_text() if page.exists() else ""

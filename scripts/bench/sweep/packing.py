@@ -76,7 +76,8 @@ def where_time_goes(out: Path, start: float, before: Load) -> dict[str, Any]:
     names = sorted(place.done())
     rows = sorted(place.rows(names).values(), key=lambda row: float(row["began"]))
     seen: set[int] = set()
-    first, later = [], []
+    first: list[float] = []
+    later: list[float] = []
     for row in rows:
         (later if row["process"] in seen else first).append(float(row["seconds"]))
         seen.add(row["process"])
