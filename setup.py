@@ -6,7 +6,8 @@ Environment:
     GSFLUENT_ARCH   CUDA architectures, comma separated (default 90)
     GSFLUENT_CORE   auto (default: `_core` in checkouts, not in wheels, which it would tie to one
                     Python) | 0 | 1
-    GSFLUENT_RELEASE  1 leaves line numbers out of the kernels and compresses them
+    GSFLUENT_RELEASE  1 leaves line numbers out of the kernels and compresses them, and names of
+                    what is not exported out of the libraries
     GSFLUENT_MARCH  CPU architecture for -march (default x86-64-v3 on x86-64; empty elsewhere)
     DEBUG           1 builds with -O1 -g
 """
@@ -22,6 +23,7 @@ from torch.utils import cpp_extension
 ROOT = Path(__file__).resolve().parent
 DEBUG = os.environ.get("DEBUG") == "1"
 RELEASE = os.environ.get("GSFLUENT_RELEASE") == "1"
+NO_SYMBOLS = ["-s"] if RELEASE else []
 CORE = os.environ.get("GSFLUENT_CORE", "auto")
 if CORE not in ("auto", "0", "1"):
     raise SystemExit(f"GSFLUENT_CORE must be auto, 0 or 1, got {CORE!r}")
@@ -69,6 +71,7 @@ def cpu_extension() -> cpp_extension.CppExtension:
         include_dirs=[str(ROOT / "csrc")],
         depends=sources("csrc/**/*.h"),
         extra_compile_args={"cxx": [TORCH_TARGET, *cxx_flags()]},
+        extra_link_args=NO_SYMBOLS,
         py_limited_api=True,
     )
 
@@ -119,7 +122,7 @@ def cuda_extension() -> list:
                 ],
             },
             # libtorch.so pulls in libtorch_cuda.so on the GPU machine; --as-needed would drop it.
-            extra_link_args=["-Wl,--no-as-needed", "-ltorch", "-Wl,--as-needed"],
+            extra_link_args=["-Wl,--no-as-needed", "-ltorch", "-Wl,--as-needed", *NO_SYMBOLS],
             py_limited_api=True,
         )
     ]

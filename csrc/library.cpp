@@ -46,10 +46,7 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "solver_run(Tensor(a!)[] buffers, int[] ints, float[] floats, int rounds, int steps) -> ()");
   m.def("solver_ranks(Tensor[] buffers, int[] ints, float[] floats) -> Tensor");
   m.def(
-      "solver_prime_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "
-      "bool load) -> ()");
-  m.def(
-      "solver_gather_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats) "
+      "solver_prime_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats) "
       "-> ()");
   m.def(
       "solver_run_ranks(Tensor(a!)[] buffers, Tensor(b!)[] parts, int[] ints, float[] floats, "

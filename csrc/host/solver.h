@@ -348,18 +348,11 @@ struct SolverOps {
   }
 
   // Several ranks on CUDA: `parts` holds the buffers of each, one after the other, and `buffers`
-  // those of all. As solver_prime; before that the points go to the ranks, if they should.
+  // those of all, which have no points. As solver_prime.
   static void solver_prime_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
-                                 std::vector<double> floats, bool load) {
+                                 std::vector<double> floats) {
     call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
-      Backend::prime_ranks(std::move(views), like, law_set(ints), load);
-    });
-  }
-  // The points go back to the buffers of all.
-  static void solver_gather_ranks(Buffers buffers, Buffers parts, std::vector<int64_t> ints,
-                                  std::vector<double> floats) {
-    call_ranks(buffers, parts, ints, floats, [&](auto views, const Buffers& like) {
-      Backend::gather_ranks(std::move(views), like);
+      Backend::prime_ranks(std::move(views), like, law_set(ints));
     });
   }
   // As solver_run.
@@ -378,7 +371,6 @@ struct SolverOps {
       GSF_IMPL(SolverOps, solver_ranks);
     } else {
       GSF_IMPL(SolverOps, solver_prime_ranks);
-      GSF_IMPL(SolverOps, solver_gather_ranks);
       GSF_IMPL(SolverOps, solver_run_ranks);
     }
   }

@@ -13,7 +13,7 @@ Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC), Wang et al. 2020 an
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -22,6 +22,7 @@ from torch import Tensor
 from gsfluent._check import check_tensor
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.ops import solver_buffers as layout
+from gsfluent.ops import solver_points as points
 from gsfluent.ops.blocks import check_dx
 from gsfluent.ops.collider import RESTITUTION, check_colliders, pad_colliders
 from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
@@ -29,7 +30,6 @@ from gsfluent.ops.solver_ranks import MOST_RANKS, Parts, check_devices
 from gsfluent.ops.solver_state import (
     DAMAGE_FIELD,
     MORE_LAWS,
-    UNBROKEN,
     VISCOUS,
     VISCOUS_ANY,
     SolverState,
@@ -154,7 +154,9 @@ class Solver(SolverState):
             each other what they share (docs/theory/ranks.md): the same bits for any number. In
             lockstep on one device, which is slower than 1; the rehearsal for several. 1 to 64.
         devices: CUDA devices of one host, as in ``["cuda:0", "cuda:1"]``: one rank on each. That of
-            ``position`` and the others is among them. Default: all ranks where the points lie.
+            ``position`` and the others is among them, or these lie in host memory, where they need
+            not fit into a device, and what is read of the state goes there. Default: all ranks
+            where the points lie.
 
     Raises:
         TypeError: Wrong type or dtype.
@@ -223,7 +225,9 @@ class Solver(SolverState):
         check_tensor(op, "params", params, shape=(law.shape[0], 8))
         self.dx = check_dx(op, dx)
         self._surface(radius, like, self.dx, cfl)
-        self.device, self.dtype, self.count = velocity.device, velocity.dtype, n
+        self.outside, self.dtype, self.count = velocity.device, velocity.dtype, n
+        self.devices = [] if devices is None else check_devices(devices, self.outside)
+        self.device = self.devices[0] if self.devices and not velocity.is_cuda else self.outside
         self.gravity = tuple(float(g) for g in gravity)
         if len(self.gravity) != 3 or not all(math.isfinite(g) for g in self.gravity):
             raise ValueError(f"{op}: gravity must be three finite numbers, got {gravity}")
@@ -238,7 +242,7 @@ class Solver(SolverState):
         ):  # fmt: skip
             if not least <= number <= most:
                 raise ValueError(f"{op}: {name} must lie in [{least:g}, {most:g}], got {number}")
-        self._params, self._law = params.to(velocity), law.to(self.device)
+        self._params, self._law = params.to(self.device, self.dtype), law.to(self.device)
         check_params(op, self._law, self._params)
         laws = set(law.tolist())
         self._law_set = 0 if laws <= {ELASTIC} else 1 if laws <= {ELASTIC, NACC} else 2
@@ -257,7 +261,7 @@ class Solver(SolverState):
                 raise ValueError(f"{op}: at1 and at2 in one simulation; give all matter one")
         self._thickens(viscous, like, laws)
         self.flip = self._flip(flip)
-        self.ranks = self._ranks(ranks, devices)
+        self.ranks = self._ranks(ranks)
         self.irreversible, self.implicit, self.k, self.epsilon = irreversible, implicit, k, epsilon
         _no_restitution(op, restitution, colliders)
         self.friction, self.restitution, self.contact_gap = friction, restitution, contact_gap
@@ -266,13 +270,13 @@ class Solver(SolverState):
         if not bool((self._params[:, 6] > 0).all()):
             raise ValueError(f"{op}: density (params column 6) must be positive")
         row, rows, row_law = self._rows(material, mass, volume)
-        b = layout.empty_buffers(velocity, n)
+        b = layout.empty_buffers(self.device, self.dtype)
         b.law, b.rows = row_law, rows
         if self._law_set == DAMAGE_FIELD and self.device.type == "cuda":
             b.damage_scale = self._damage_scale(row_law, rows)
         if colliders is not None and colliders.shape[0] > 0:
             check_colliders(op, pad_colliders(colliders), 0 if sdf is None else sdf.shape[0])
-            b.colliders = pad_colliders(colliders).to(velocity).clone().contiguous()
+            b.colliders = pad_colliders(colliders).to(self._params, copy=True).contiguous()
             b.collider_state = pad_colliders(colliders).to(self.device, torch.float64).clone()
             shape = (colliders.shape[0], layout.IMPULSE_SUMS)
             b.impulse_units = torch.zeros(shape, dtype=torch.int64, device=self.device)
@@ -281,36 +285,17 @@ class Solver(SolverState):
                 check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
                 b.sdf = sdf.to(self.device).contiguous()
         if radius is not None:
-            b.radius = radius.contiguous()
+            b.radius = radius.to(self.device).contiguous()
             if self.device.type == "cuda":  # on a CPU the kernels have them
                 b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
         self._whole, self._parts = b, None
         self.frame = self._frame(velocity, mass, body, frame, b.colliders.numel() > 0)
-        if bool(self.frame.any()):
-            velocity = (velocity.double() - self.frame).to(velocity)
-        zero = velocity.new_zeros
-        values = {
-            "velocity": velocity,
-            "slope": (affine if affine is not None else zero(n, 3, 3)).reshape(n, 9)
-            * mass[:, None],
-            "strain": strain if strain is not None else zero(n, 6),
-        }
-        start = alpha if alpha is not None else zero(n)
-        none = torch.full_like(start, UNBROKEN)
-        scalars = {"alpha": start, "peak": torch.where(b.law[row] == NACC, start, none)}
-        if peak is not None:
-            breaks = (b.law[row] == NACC) | (b.law[row] == PHASE)
-            scalars["peak"] = torch.where(breaks, peak, none)
-        self._unused = {} if self._law_set > 0 else scalars
-        if self._law_set > 0:
-            values.update(scalars)
-        if deformation is not None:
-            values["deformation"] = deformation.reshape(n, 9)
+        more = {name: value for name, value, _ in optional if value is not None}
         if viscous is not None:
-            values["viscous"] = viscous
-        if self.flip > 0.0:
-            b.own = zero(n, 9)
-        self._load(position, values, row, body)
+            more["viscous"] = viscous
+        self._alpha = None if self._law_set > 0 else alpha
+        self._hold(self._law_set > 0, flip, more.keys())
+        self.fields = self._fields(body)
         if objects is not None:
             if radius is None:
                 raise InputError(
@@ -318,10 +303,11 @@ class Solver(SolverState):
                     hint="give radius too, or leave out objects: fields then touch at nodes",
                 )
             b.object = self._per_field("objects", objects)
-            if self.device.type == "cuda":
-                b.press = torch.zeros_like(b.sums)
         if parent is not None or cut is not None:
             b.parent, b.cut = self._per_field("parent", parent), self._per_field("cut", cut)
+        if self.ranks > 1 and self.device.type == "cuda":
+            self._parts = Parts(b, self.devices, self.fields, self._widths, *self._settings())
+        self._load(points.Given(position, velocity, mass, row, body, more, self.frame, self.dx))
         heaviest = float(mass.max())
         bits = sum_bits(n)
         self._write(
@@ -329,8 +315,26 @@ class Solver(SolverState):
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
         )  # fmt: skip
-        if self.ranks > 1 and self.device.type == "cuda":
-            self._parts = Parts(b, self.devices, self.fields, *self._settings())
+
+    def _hold(self, breaks: bool, flip: float, given: Iterable[str]) -> None:
+        """Say what is to be held of each point."""
+        held = layout.ON_DEVICE if self.device.type == "cuda" else layout.ON_CPU
+        unused = {"deformation", "viscous"} - set(given) | (set() if flip > 0.0 else {"own"})
+        unused |= set() if breaks else {"alpha", "peak"}
+        self._widths = {name: width for name, width in held.items() if name not in unused}
+        self._widths |= layout.SCRATCH
+
+    def _fields(self, body: Tensor | None) -> int:
+        """The number of velocity fields, checked."""
+        if body is None:
+            return 1
+        check_tensor("Solver", "body", body, shape=(self.count,), dtype=torch.int32)
+        low, high = int(body.min()), int(body.max())
+        if low < 0 or high >= layout.MAX_FIELDS:
+            raise ValueError(
+                f"Solver: body must lie in 0 to {layout.MAX_FIELDS - 1}, got {low} to {high}"
+            )
+        return high + 1
 
     def _per_field(self, name: str, given: Tensor | None) -> Tensor:
         """A whole number of each field, checked, where the state is."""
@@ -364,10 +368,9 @@ class Solver(SolverState):
             )
         return float(share)
 
-    def _ranks(self, ranks: int, devices: Sequence[str | torch.device] | None) -> int:
+    def _ranks(self, ranks: int) -> int:
         """The number of ranks, checked, and that every part of the scene knows of them."""
-        if devices is not None:
-            self.devices = check_devices(devices, self.device)
+        if self.devices:
             if ranks not in (1, len(self.devices)):
                 raise InputError(
                     f"Solver: {ranks} ranks on {len(self.devices)} devices",
@@ -379,8 +382,7 @@ class Solver(SolverState):
                 f"Solver: ranks must be a whole number of 1 to {MOST_RANKS}, got {ranks!r}",
                 hint="1 steps the whole scene at once",
             )
-        if devices is None:
-            self.devices = [self.device] * ranks
+        self.devices = self.devices or [self.device] * ranks
         unknown = {
             f"device {self.device.type}": self.device.type not in ("cpu", "cuda"),
             "law phase_field (9)": self._law_set == DAMAGE_FIELD,
@@ -542,34 +544,45 @@ class Solver(SolverState):
                 "Solver.rank_counts: nothing is cut before a step, nor for one rank on a GPU",
                 hint="advance the solver first",
             )
-        rows = torch.ops.gsfluent.solver_ranks(self._buffers.listed(), *self._settings())
+        rows = torch.ops.gsfluent.solver_ranks(self._whole.listed(), *self._settings())
         names = ("points", "homes", "slots", "shared")
         return [dict(zip(names, row, strict=True)) for row in rows.tolist()]
 
     # --- going back ---
 
-    _MOVING = ("clock", "offset", "meta", "velocity", "slope", "strain", "alpha", "peak",
-               "deformation", "viscous", "id", "impulse", "colliders", "collider_state",
-               "home_coord0",
-               "home_start0", "home_count0", "home_coord1", "home_start1",
+    _MOVING = ("clock", "impulse", "colliders", "collider_state",
+               "home_coord0", "home_start0", "home_count0", "home_coord1", "home_start1",
                "home_count1")  # fmt: skip
 
     def snapshot(self) -> dict[str, Any]:
         """Copy everything that changes, for :meth:`restore`."""
-        return {name: getattr(self._buffers, name).clone() for name in self._MOVING}
+        names = (*self._MOVING, *(self._widths.keys() - layout.SCRATCH.keys()))
+        return {
+            f"{index} {name}": getattr(b, name).clone()
+            for index, b in enumerate(self._all_buffers())
+            for name in names
+        }
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Go back to a :meth:`snapshot` of this solver."""
-        b = self._whole
-        if self._parts is not None:
-            self._parts.recall()
-        for name, value in saved.items():
+        buffers = self._all_buffers()
+        for key, value in saved.items():
+            index, name = key.split()
+            b = buffers[int(index)]
             target = getattr(b, name)
             if target.shape == value.shape:
                 target.copy_(value)
-            else:  # room for blocks has grown since
+            elif name in self._widths:  # room for points has grown since
+                room = target.numel() // self._widths[name]
+                setattr(b, name, layout.more_room(value, self._widths[name], room))
+            else:  # that for blocks
                 target.zero_()
                 target[: value.shape[0]] = value
-        for name in ("sums", "moments", "push", "press", "impulse_units"):
-            getattr(b, name).zero_()
+        for b in buffers:
+            for name in ("sums", "moments", "push", "press", "impulse_units"):
+                getattr(b, name).zero_()
         self._write(rebuild=1, done=1, grow=0, reason=0, touched=0, lost=0, leaving=0)
+
+    def _all_buffers(self) -> list[layout.Buffers]:
+        """Those of all, and of each rank on CUDA."""
+        return [self._whole, *(self._parts.parts if self._parts else [])]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -21,6 +22,18 @@ MAX_PARTICLES = 2**29
 """Their places fit into 32 bits, on any number of ranks."""
 MAX_HOME = 2**26
 """Points of one home; more could overflow its fixed-point sums (docs/theory/solver-sums.md)."""
+
+CHUNK = 2**24
+"""Points that are loaded or read at a time, so that what this takes does not grow with all."""
+ON_CPU = {"offset": 3, "meta": 1, "velocity": 3, "slope": 9, "strain": 6, "alpha": 1, "peak": 1,
+          "deformation": 9, "id": 1, "viscous": 9, "own": 9}  # fmt: skip
+"""What is held of each point, and its components (``csrc/core/solver/layout.h``)."""
+ON_DEVICE = {name: width for name, width in ON_CPU.items() if name not in ("meta", "slope")} | {
+    "offset": 4, "velocity": 12,
+}  # fmt: skip
+"""There the offset holds the meta word and the velocity the slope."""
+SCRATCH = {"spare": 9, "entry": 1, "place": 1}
+"""Of each point, for builds."""
 
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
@@ -120,6 +133,12 @@ class Buffers:
         """Return the bytes of all tensors."""
         return sum(t.numel() * t.element_size() for t in self.listed())
 
+    def reserve_points(self, widths: dict[str, int], count: int) -> None:
+        """Make room for so many points in these tensors; what they hold is kept."""
+        for name, width in widths.items():
+            flat = "meta" not in widths or width == 1
+            setattr(self, name, more_room(getattr(self, name), width, count, flat=flat))
+
     def reserve_blocks(self, homes: int, slots: int, fields: int) -> None:
         """Make room for blocks; the list of present homes is kept, nothing else needs to be."""
         like = self.offset
@@ -149,7 +168,7 @@ class Buffers:
         self.slot_near = torch.zeros(slots, dtype=torch.int64, device=device)
         self.node_velocity = torch.zeros(slots, BLOCK_NODES, 4, dtype=real, device=device)
         if device.type == "cuda":  # on a CPU the kernels have them
-            if self.own.numel() or self.free_velocity.numel():  # points may be with ranks
+            if self.own.numel():
                 self.free_velocity = torch.zeros_like(self.node_velocity)
             if self.radius.numel():
                 self.push, self.slot_given = torch.zeros_like(self.sums), whole(slots)
@@ -181,35 +200,44 @@ class Buffers:
         self.needers = torch.zeros_like(self.holders)
 
 
-def planes(values: Tensor) -> Tensor:
-    """Rows [N, W] in planes of up to four components, as a device keeps them: flat, N W values.
+def groups(values: Tensor, width: int) -> Iterator[Tensor]:
+    """Views [N, components] of ``width`` components per point, as they lie in memory.
 
-    See ``csrc/core/solver/layout.h``.
+    Rows on a CPU; on a device flat, planes of up to four components each
+    (``csrc/core/solver/layout.h``).
     """
-    return torch.cat([part.reshape(-1) for part in values.split(4, dim=1)])
-
-
-def more_room(values: Tensor, width: int, count: int) -> Tensor:
-    """Planes of ``width`` components per point with room for ``count`` points; as many as fit."""
-    values, new = values.reshape(-1), values.new_zeros(count * width)
-    old = values.numel() // width
-    kept, begin, start = min(old, count), 0, 0
+    if values.dim() == 2:
+        yield values
+        return
+    count, begin = values.numel() // width, 0
     for left in range(width, 0, -4):
-        size = min(4, left)
-        new[start : start + kept * size] = values[begin : begin + kept * size]
-        begin, start = begin + old * size, start + count * size
+        end = begin + min(4, left) * count
+        yield values[begin:end].view(count, min(4, left))
+        begin = end
+
+
+def put_rows(values: Tensor, width: int, places: Tensor, rows: Tensor) -> None:
+    """Write rows [n, width] to these places."""
+    begin, rows = 0, rows.reshape(-1, width)
+    for group in groups(values, width):
+        end = begin + group.shape[1]
+        group.index_copy_(0, places, rows[:, begin:end].to(values.dtype))
+        begin = end
+
+
+def get_rows(values: Tensor, width: int, begin: int, end: int) -> Tensor:
+    """The rows [n, width] of places ``begin`` to ``end``."""
+    return torch.cat([group[begin:end] for group in groups(values, width)], dim=1)
+
+
+def more_room(values: Tensor, width: int, count: int, *, flat: bool = True) -> Tensor:
+    """The same with room for ``count`` points; as many are kept as fit."""
+    new = values.new_zeros(count * width) if flat else values.new_zeros(count, width)
+    if values.numel():
+        for old, group in zip(groups(values, width), groups(new, width), strict=True):
+            kept = min(len(old), count)
+            group[:kept] = old[:kept]
     return new
-
-
-def from_planes(values: Tensor, width: int) -> Tensor:
-    """The rows [N, W] that :func:`planes` was given."""
-    count = values.numel() // width
-    parts, at = [], 0
-    for left in range(width, 0, -4):
-        size = min(4, left)
-        parts.append(values[at : at + count * size].view(count, size))
-        at += count * size
-    return torch.cat(parts, dim=1)
 
 
 def word_as_real(word: Tensor, like: Tensor) -> Tensor:
@@ -225,9 +253,8 @@ def real_as_word(real: Tensor) -> Tensor:
     return real.contiguous().view(whole).long() & (2**32 - 1)
 
 
-def empty_buffers(like: Tensor, count: int) -> Buffers:
-    """Buffers for ``count`` particles without blocks, materials or optional parts."""
-    device, real = like.device, like.dtype
+def empty_buffers(device: torch.device, real: torch.dtype) -> Buffers:
+    """Buffers without points, blocks, materials or optional parts."""
 
     def zeros(*shape: int, dtype: torch.dtype = real) -> Tensor:
         return torch.zeros(shape, dtype=dtype, device=device)
@@ -235,12 +262,9 @@ def empty_buffers(like: Tensor, count: int) -> Buffers:
     values = {}
     for field in dataclasses.fields(Buffers):
         values[field.name] = zeros(0)
-    for name in ("id", "entry", "place"):
-        values[name] = zeros(count, dtype=torch.int32)
-    values["spare"], values["meta"] = zeros(count, 9), zeros(0, dtype=torch.int32)
-    whole = ("law", "home_start0", "home_count0", "home_start1", "home_count1", "parent", "cut",
-             "object", "slot_given", "home_rank", "home_place", "damage_slots", "damage_homes",
-             "damage_counts")  # fmt: skip
+    whole = ("id", "entry", "place", "meta", "law", "home_start0", "home_count0", "home_start1",
+             "home_count1", "parent", "cut", "object", "slot_given", "home_rank", "home_place",
+             "damage_slots", "damage_homes", "damage_counts")  # fmt: skip
     for name in whole:
         values[name] = zeros(0, dtype=torch.int32)
     for name in ("home_coord0", "home_coord1"):

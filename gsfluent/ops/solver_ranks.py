@@ -25,10 +25,6 @@ MAIL_WORDS = 11
 PATIENCE = 60.0
 """Wall time without a finished step after which a device counts as stalled [s]."""
 
-_POINTS = {"offset": 4, "velocity": 12, "strain": 6, "alpha": 1, "peak": 1, "deformation": 9,
-           "id": 1, "viscous": 9, "own": 9}  # fmt: skip
-"""What ranks hold of their points, and its components."""
-_SCRATCH = {"spare": 9, "entry": 1, "place": 1}
 _POINTS_MORE, _HOMES_MORE, _A_FEW = 0.1, 0.25, 64
 """Room for more points and homes than a rank has now, in parts of them; and for so many."""
 _MOVING = ("colliders", "collider_state", "impulse")
@@ -39,8 +35,8 @@ def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> 
     """The devices of the ranks, one each, checked.
 
     Raises:
-        InputError: One that is no CUDA device or not there; ``home``, where the points lie, is not
-            among them.
+        InputError: One that is no CUDA device or not there; ``home``, where the points lie, is
+            another GPU.
     """
     there = torch.cuda.device_count()
     found = []
@@ -83,10 +79,10 @@ def check_devices(devices: Sequence[str | torch.device], home: torch.device) -> 
                     f"Solver: devices: {device} cannot reach the memory of {other}",
                     hint="name devices that are linked; `nvidia-smi topo -p2p r` shows which",
                 )
-    if home not in found:
+    if home.type != "cpu" and home not in found:
         raise InputError(
             f"Solver: the points lie on {home}, which is none of devices",
-            hint=f"name it too, or move position and the others to {found[0]}",
+            hint=f"name it too, or move position and the others to {found[0]} or to the CPU",
         )
     return found
 
@@ -98,27 +94,30 @@ class Parts:
         whole: Buffers of all, which get what only ranks need.
         devices: Device of each rank.
         fields: Velocity fields.
+        widths: What is held of each point, and its components.
         ints, floats: Settings of the operators.
-
-    Attributes:
-        away: Whether the points lie with the ranks and not in the buffers of all.
     """
 
     def __init__(
         self, whole: layout.Buffers, devices: Sequence[torch.device], fields: int,
-        ints: list[int], floats: list[float],
+        widths: dict[str, int], ints: list[int], floats: list[float],
     ) -> None:  # fmt: skip
         self.whole, self.devices, self.fields = whole, tuple(devices), fields
-        self._settings, self.away = (ints, floats), False
+        self._settings, self._widths, self._count = (ints, floats), widths, ints[-1]
         self._equip(whole)
-        self._used = {name: width for name, width in _POINTS.items()
-                      if getattr(whole, name).numel()}  # fmt: skip
-        self._count = whole.id.numel()
-        for name in _SCRATCH:  # a build's; those of the ranks do it
-            setattr(whole, name, getattr(whole, name).new_zeros(0))
-        share = -(-self._count // len(devices))
-        homes = -(-int(whole.clock[layout.INDEX["homes"]]) // len(devices))
-        self.parts = [self._part(device, share, homes) for device in devices]
+        self.parts = [self._part(device) for device in devices]
+
+    def room(self, points: int) -> int:
+        """Room for so many points of a rank and some more."""
+        return min(self._count, _with_room(points, _POINTS_MORE))
+
+    def reserve(self, homes: int, listed: Sequence[int]) -> None:
+        """Room for blocks: of each rank for its share of all homes, and for those listed now."""
+        share = _with_room(-(-homes // len(self.parts)), _HOMES_MORE)
+        slots = self.whole.slot_next.shape[0]
+        for part, own in zip(self.parts, listed, strict=True):
+            part.reserve_blocks(max(share, own), slots, self.fields)
+            part.clock[layout.INDEX["homes"]] = own
 
     def _equip(self, b: layout.Buffers) -> None:
         """Room for what ranks need beside the rest."""
@@ -129,8 +128,8 @@ class Parts:
         b.peers = torch.zeros(room, dtype=torch.uint8, device=device)
         b.reserve_ranks()
 
-    def _part(self, device: torch.device, points: int, homes: int) -> layout.Buffers:
-        """Buffers of a rank with about so many points and homes, and for all blocks."""
+    def _part(self, device: torch.device) -> layout.Buffers:
+        """Buffers of a rank, without points and blocks."""
         whole = self.whole
         part = dataclasses.replace(whole)
         for field in dataclasses.fields(whole):
@@ -142,17 +141,8 @@ class Parts:
             else:
                 new = value.new_zeros((0, *value.shape[1:]), device=device)
             setattr(part, field.name, new)
-        part.home_start0 = part.home_start0.new_zeros(0)
-        self._make_room(part, points)
-        part.reserve_blocks(_with_room(homes, _HOMES_MORE), whole.slot_next.shape[0], self.fields)
         self._equip(part)
         return part
-
-    def _make_room(self, part: layout.Buffers, points: int) -> None:
-        """Room for so many points of a rank and some more; those that it has are kept."""
-        room = min(self._count, _with_room(points, _POINTS_MORE))
-        for name, width in (*self._used.items(), *_SCRATCH.items()):
-            setattr(part, name, layout.more_room(getattr(part, name), width, room))
 
     def _lists(self) -> tuple[list[Tensor], list[Tensor], list[int], list[float]]:
         """What the operators take: buffers of all, of one rank after the other, settings."""
@@ -165,17 +155,8 @@ class Parts:
             for name in _MOVING:
                 getattr(part, name).copy_(getattr(self.whole, name))
             part.impulse_units.zero_()
-        load = not self.away
-        torch.ops.gsfluent.solver_prime_ranks(*self._lists(), load)
+        torch.ops.gsfluent.solver_prime_ranks(*self._lists())
         self._wait()
-        while load and int(self.whole.clock[layout.INDEX["grow"]]):  # nothing was loaded
-            self.whole.clock[layout.INDEX["grow"]] = 0
-            self.grow()
-            torch.ops.gsfluent.solver_prime_ranks(*self._lists(), load)
-            self._wait()
-        self.away = True
-        for name in self._used:
-            setattr(self.whole, name, getattr(self.whole, name).new_zeros(0))
 
     def run(self, rounds: int, steps: int) -> None:
         """As ``solver_run``."""
@@ -213,19 +194,6 @@ class Parts:
                 "  hint: nvidia-smi and dmesg show which and why; start anew without it"
             ) from error
 
-    def gather(self) -> None:
-        """Bring the points back, if they are away."""
-        if self.away:
-            self.recall()
-            torch.ops.gsfluent.solver_gather_ranks(*self._lists())
-
-    def recall(self) -> None:
-        """Room for the points in the buffers of all; those of the ranks count no more."""
-        self.away = False
-        for name, width in self._used.items():
-            value = getattr(self.whole, name)
-            setattr(self.whole, name, layout.more_room(value, width, self._count))
-
     def grow(self) -> None:
         """Make room on every rank: for as many blocks as ``whole``, and for what the rank wants."""
         slots, table = self.whole.slot_next.shape[0], self.whole.key.shape[0]
@@ -234,7 +202,7 @@ class Parts:
             points, homes = (int(clock[layout.INDEX[name]]) for name in ("cursor", "wanted_homes"))
             room = part.home_start0.shape[0]
             if points > part.id.numel():
-                self._make_room(part, points)
+                part.reserve_points(self._widths, self.room(points))
             if homes > room and points > 0:  # else it is the table of blocks that was full
                 room = _with_room(homes, _HOMES_MORE)
             if (room, slots, table) != (

@@ -7,24 +7,27 @@ order changes from build to build; here they come back in the order they were gi
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from gsfluent._check import check_tensor
+from gsfluent.errors import InputError
 from gsfluent.materials.phase_field import MODELS
 from gsfluent.ops import solver_buffers as layout
+from gsfluent.ops import solver_points as points
 from gsfluent.ops.plasticity import LAWS, SLOW_UNLOADING, return_mapping, weakened
 from gsfluent.ops.reference.phase_field import DRIVE_MAX, EMPTY
 from gsfluent.ops.solver_buffers import INDEX
+from gsfluent.ops.solver_points import UNBROKEN
 from gsfluent.ops.solver_ranks import Parts
 from gsfluent.ops.viscous import viscous_step
 
-UNBROKEN = -1.0
-"""Peak alpha of points whose law does not break."""
 MORE_LAWS, DAMAGE_FIELD, VISCOUS, VISCOUS_ANY = 3, 4, 5, 6
 """Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``."""
+_VALUES = {"position", "body", "velocity", "affine", "strain", "alpha", "peak", "deformation",
+           "viscous", "stress"}  # fmt: skip
 REST = 1e-3
 """Share of the fastest speed below which the matter of a scene counts as resting on the whole."""
 
@@ -38,17 +41,19 @@ class SolverState:
     """State of :class:`gsfluent.ops.Solver`: loading it, and reading it in the order of loading.
 
     Attributes:
-        device: Device of every tensor.
+        device: Device of the state; of several, the one whose clock is read.
+        outside: Where the points were given, and what is read of them goes.
         dtype: Of the state.
         count: Points N.
         dx: Node spacing [m].
         fields: Velocity fields.
-        frame: Velocity of the grid [m/s], float64 [3].
+        frame: Velocity of the grid [m/s], float64 [3] on the CPU.
         irreversible: Whether broken points lose their cohesion for good.
         implicit, k, epsilon: Options of the return map.
     """
 
     device: torch.device
+    outside: torch.device
     dtype: torch.dtype
     count: int
     dx: float
@@ -59,20 +64,15 @@ class SolverState:
     k: float
     epsilon: float
     _whole: layout.Buffers
-    """Every tensor; of several ranks on CUDA without the points, while they are away."""
+    """Every tensor; of several ranks on CUDA without the points."""
     _params: Tensor
     _law: Tensor
-    _unused: dict[str, Tensor]
-    """alpha and peak where no law uses them, as given."""
+    _alpha: Tensor | None
+    """As given, where no law uses it."""
+    _widths: dict[str, int]
+    """What is held of each point, and its components."""
     _law_set: int
     _parts: Parts | None
-
-    @property
-    def _buffers(self) -> layout.Buffers:
-        """Every tensor, with the points in them."""
-        if self._parts is not None:
-            self._parts.gather()
-        return self._whole
 
     # --- loading ---
 
@@ -85,30 +85,36 @@ class SolverState:
         rests: bool,
     ) -> Tensor:
         """Velocity of the grid: as given, none, or the one in which most matter hardly moves."""
-        none = torch.zeros(3, dtype=torch.float64, device=self.device)
+        none = torch.zeros(3, dtype=torch.float64)
         if given is not None:
             asked = torch.tensor([float(v) for v in given], dtype=torch.float64)
             if asked.shape != (3,) or not bool(torch.isfinite(asked).all()):
                 raise ValueError(f"Solver: frame must be three finite numbers, got {given}")
             if rests and bool(asked.any()):
                 raise ValueError(f"Solver: frame must be 0 where there are colliders, got {given}")
-            return asked.to(self.device)
+            return asked
         if rests or not bool(torch.isfinite(velocity).all()):  # what is refused later
             return none
-        m, v = mass.double().cpu(), velocity.double().cpu()
-        index = torch.zeros_like(m, dtype=torch.int64) if body is None else body.long().cpu()
-        if int(index.min()) < 0:
+        fields = 1 if body is None else int(body.max()) + 1
+        if body is not None and int(body.min()) < 0:
             return none
-        whole = torch.bincount(index, m)
-        momentum = torch.stack([torch.bincount(index, m * v[:, i]) for i in range(3)], dim=1)
+        whole, momentum, fastest = none.new_zeros(fields), none.new_zeros(fields, 3), 0.0
+        for part in points.stretches(0, self.count):
+            m, v = mass[part].double().cpu(), velocity[part].double().cpu()
+            index = torch.zeros(len(m), dtype=torch.int64) if body is None else body[part].long()
+            index = index.cpu()
+            whole += torch.bincount(index, m, fields)
+            momentum += torch.stack(
+                [torch.bincount(index, m * v[:, i], fields) for i in range(3)], dim=1
+            )
+            fastest = max(fastest, float(v.norm(dim=1).max()))
         # by mass once more: a bullet does not move the grid through what it hits
         mean = (whole @ momentum) / (whole @ whole)
-        fastest = float(v.norm(dim=1).max())
         if not float(mean.norm()) > REST * fastest:
             return none
         # without the digits that hang on the order of the points
         unit = math.ldexp(1.0, math.frexp(fastest)[1] - 24)
-        return (unit * torch.round(mean / unit)).to(self.device)
+        return unit * torch.round(mean / unit)
 
     def _rows(
         self, material: Tensor | None, mass: Tensor, volume: Tensor
@@ -117,14 +123,23 @@ class SolverState:
 
         Columns after the parameters: ``csrc/core/solver/state.h``.
         """
-        n, count = self.count, self._law.shape[0]
-        if material is None:
-            material = torch.zeros(n, dtype=torch.int32, device=self.device)
-        check_tensor("Solver", "material", material, shape=(n,), dtype=torch.int32)
-        if not bool(((material >= 0) & (material < count)).all()):
-            raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
-        facts = torch.stack([material.to(torch.float64), mass.double(), volume.double()], dim=1)
-        unique, row = _unique_rows(facts)
+        count = self._law.shape[0]
+        if material is not None:
+            check_tensor("Solver", "material", material, shape=(self.count,), dtype=torch.int32)
+            if not bool(((material >= 0) & (material < count)).all()):
+                raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
+        found: list[Tensor] = []
+        row = torch.empty(self.count, dtype=torch.int32, device=self.outside)
+        for part in points.stretches(0, self.count):
+            facts = [mass.new_zeros(()).expand_as(mass)] if material is None else [material]
+            facts = [fact[part].to(self.device, torch.float64) for fact in (*facts, mass, volume)]
+            unique, index = _unique_rows(torch.stack(facts, dim=1))
+            row[part] = index.to(row) + sum(map(len, found))
+            found.append(unique)
+        if len(found) > 1:
+            unique, number = _unique_rows(torch.cat(found))
+            for part in points.stretches(0, self.count):
+                row[part] = number[row[part].to(self.device).long()].to(row)
         if unique.shape[0] > layout.MAX_ROWS:
             raise ValueError(
                 f"Solver: {unique.shape[0]} different (material, mass, volume), at most "
@@ -137,7 +152,7 @@ class SolverState:
         derived = torch.cat([1.0 / density, 4.0 * unique[:, 2:] / self.dx**2], dim=1)
         numbers = torch.cat([unique[:, 1:2], pace[:, None], derived], dim=1)
         rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
-        return row.to(torch.int64), rows.contiguous(), self._law[which].contiguous()
+        return row, rows.contiguous(), self._law[which].contiguous()
 
     def _damage_scale(self, law: Tensor, rows: Tensor) -> Tensor:
         """Units of the sums of the damage field, by the largest volume, history and stiffness.
@@ -156,71 +171,26 @@ class SolverState:
         at2 = float(int(own[0, 5]) >= MODELS["at2"])
         return own.new_tensor([*units, at2, EMPTY * most])
 
-    def _load(
-        self, position: Tensor, values: dict[str, Tensor], row: Tensor, body: Tensor | None
-    ) -> None:
-        """Group the points by block and field and store them."""
-        b, n = self._buffers, self.count
-        if body is None:
-            body = torch.zeros(n, dtype=torch.int32, device=self.device)
-        check_tensor("Solver", "body", body, shape=(n,), dtype=torch.int32)
-        low, high = int(body.min()), int(body.max())
-        if low < 0 or high >= layout.MAX_FIELDS:
-            raise ValueError(
-                f"Solver: body must lie in 0 to {layout.MAX_FIELDS - 1}, got {low} to {high}"
+    def _load(self, given: points.Given) -> None:
+        """Group the points by block and field and store them, on each rank a stretch of them."""
+        b, n = self._whole, self.count
+        stores = self._parts.parts if self._parts else [b]
+        share = -(-n // len(stores))
+        room = self._parts.room(share) if self._parts else n
+        found = [
+            points.load(
+                store, self._widths, given, min(r * share, n), min((r + 1) * share, n), room
             )
-        self.fields = high + 1
-        u = position.to(self.device, torch.float64) / self.dx - 0.5
-        limit = 4.0 * (layout.BLOCK_RANGE - 2)
-        if not bool((u.abs() < limit).all()):
-            wrong = int((~(u.abs() < limit)).any(dim=1).sum())
-            raise ValueError(
-                f"Solver: position must be finite and within {limit:.0f} cells of the origin, "
-                f"got {wrong} of {n} rows that are not"
-            )
-        for name, value in values.items():
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"Solver: {name} must be finite")
-        cell = torch.floor(u)
-        offset = (u - cell).to(self.dtype)
-        over = offset >= 1.0
-        cell = (cell + over).long()
-        offset = offset.masked_fill(over, 0.0)
-        block = cell >> 2
-        key = self._keys(block, body.long())
-        unique, owner, counts = torch.unique(key, return_inverse=True, return_counts=True)
-        order = torch.argsort(owner, stable=True)
-        local = (cell - 4 * block + 1)[order]
-        word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row[order] << 9
-        b.id = order.to(torch.int32)
-        rows = {name: value.index_select(0, order).to(self.dtype) for name, value in values.items()}
-        self._store(offset[order], word, rows)
-        coord = self._unkey(unique)
-        homes, reach = unique.shape[0], self._reach(coord)
-        b.reserve_blocks(homes + homes // 2 + 64, reach + reach // 3 + 64, self.fields)
-        b.home_coord0[:homes] = coord.to(torch.int32)
-        b.home_count0[:homes] = counts.to(torch.int32)
-        b.home_start0[:homes] = (torch.cumsum(counts, 0) - counts).to(torch.int32)
+            for r, store in enumerate(stores)
+        ]
+        key = torch.unique(torch.cat([own.to(self.device) for own, _ in found]))
+        homes, slots = len(key), points.reach(key)
+        b.reserve_blocks(homes + homes // 2 + 64, slots + slots // 3 + 64, self.fields)
+        if self._parts:
+            self._parts.reserve(homes, [len(own) for own, _ in found])
+        for store, (own, counts) in zip(stores, found, strict=True):
+            points.list_homes(store, own, counts)
         self._write(homes=homes, parity=0, rebuild=1, done=1, grow=0, reason=0)
-
-    @staticmethod
-    def _keys(block: Tensor, field: Tensor) -> Tensor:
-        shift = block + layout.BLOCK_RANGE
-        return ((shift[:, 0] << 17 | shift[:, 1]) << 17 | shift[:, 2]) << 12 | field
-
-    @staticmethod
-    def _unkey(key: Tensor) -> Tensor:
-        parts = [key >> 46, key >> 29, key >> 12]
-        block = [(part & (2**17 - 1)) - layout.BLOCK_RANGE for part in parts]
-        return torch.stack([*block, key & (2**12 - 1)], dim=1)
-
-    def _reach(self, coord: Tensor) -> int:
-        """Number of blocks that windows of these homes can touch at most."""
-        axis = torch.arange(-1, 2, device=coord.device)
-        step = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).view(27, 3)
-        block = (coord[:, None, :3] + step).reshape(-1, 3)
-        field = coord[:, 3].repeat_interleave(27)
-        return int(torch.unique(self._keys(block, field)).shape[0])
 
     # --- the clock ---
 
@@ -275,125 +245,127 @@ class SolverState:
 
     # --- reading ---
 
-    def _owners(self) -> Tensor:
-        """Block and field of each stored point, int64 [N, 4]."""
-        b, now = self._buffers, self.clock()
-        side, homes = str(int(now["parity"])), int(now["homes"])
-        start = getattr(b, f"home_start{side}")[:homes].long()
-        order = torch.argsort(start)
-        counts = getattr(b, f"home_count{side}")[:homes].long()[order]
-        return (
-            getattr(b, f"home_coord{side}")[:homes]
-            .long()[order]
-            .repeat_interleave(counts, dim=0, output_size=self.count)
-        )
+    def _stores(self) -> list[layout.Buffers]:
+        """The buffers that hold points."""
+        return self._parts.parts if self._parts else [self._whole]
 
-    def _store(self, offset: Tensor, word: Tensor, rows: dict[str, Tensor]) -> None:
-        """Lay the rows out as ``csrc/core/solver/layout.h`` says."""
-        b = self._buffers
-        if self.device.type == "cuda":
-            bits = layout.word_as_real(word, offset)[:, None]
-            motion = torch.cat([rows.pop("velocity"), rows.pop("slope")], dim=1)
-            b.offset = layout.planes(torch.cat([offset, bits], dim=1))
-            b.velocity = layout.planes(motion)
-            for name, value in rows.items():
-                setattr(b, name, layout.planes(value) if value.dim() == 2 else value.contiguous())
-            return
-        # The word is unsigned there; wrap it into the signed type torch has.
-        b.meta = torch.where(word >= 2**31, word - 2**32, word).to(torch.int32)
-        b.offset = offset.contiguous()
-        for name, value in rows.items():
-            setattr(b, name, value.contiguous())
+    def chunks(self, name: str) -> Iterator[tuple[Tensor, Tensor]]:
+        """Values of the points as they lie, some at a time, each on the device that has them.
 
-    def _rowwise(self, name: str) -> Tensor:
-        """Stored values with one row per point."""
-        b = self._buffers
-        if self.device.type != "cuda":
-            value: Tensor = getattr(b, name)
-            return value
-        if name == "offset":
-            return layout.from_planes(b.offset, 4)[:, :3]
-        if name in ("velocity", "slope"):
-            motion = layout.from_planes(b.velocity, 12)
-            return motion[:, :3] if name == "velocity" else motion[:, 3:]
-        return layout.from_planes(getattr(b, name), 6 if name == "strain" else 9)
+        So is read what is too large for one device, or for the host.
 
-    def _words(self) -> Tensor:
-        """Cell and row of each stored point, int64 [N]."""
-        if self.device.type == "cuda":
-            return layout.real_as_word(layout.from_planes(self._buffers.offset, 4)[:, 3])
-        return self._buffers.meta.long() & (2**32 - 1)
+        Args:
+            name: position, body, velocity, affine, strain, alpha, peak, stress; deformation or
+                viscous where there is one.
 
-    def _restored(self, values: Tensor) -> Tensor:
-        """Bring stored values into the order of loading."""
-        out = torch.empty_like(values, memory_format=torch.contiguous_format)
-        return out.index_copy_(0, self._buffers.id.long(), values)
+        Returns:
+            Where points stand in the order of loading, int64 [n], and their values, [n, ...].
+
+        Raises:
+            InputError: No such values.
+        """
+        missing = {"deformation", "viscous"} - self._widths.keys()
+        if name not in _VALUES or name in missing:
+            raise InputError(
+                f"Solver.chunks: there is no {name!r} here",
+                hint=f"one of {', '.join(sorted(_VALUES - missing))}",
+            )
+        of = getattr(self, f"_{name}_of", None)
+        for b in self._stores():
+            for lot in points.lots(b, self._widths):
+                yield lot.index, lot.rows(name) if of is None else of(lot)
+
+    def _read(self, name: str) -> Tensor:
+        """Values in the order of loading, where the points were given."""
+        out: Tensor | None = None
+        for index, values in self.chunks(name):
+            if out is None:
+                out = values.new_empty((self.count, *values.shape[1:]), device=self.outside)
+            out[index.to(out.device)] = values.to(out.device)
+        assert out is not None  # there is a point
+        return out
 
     @property
     def position(self) -> Tensor:
         """Positions [m], float64 [N, 3]."""
-        word = self._words()
+        return self._read("position")
+
+    def _position_of(self, lot: points.Lot) -> Tensor:
+        word = lot.words
         local = torch.stack([word & 7, word >> 3 & 7, word >> 6 & 7], dim=1)
-        cell = 4 * self._owners()[:, :3] - 1 + local
-        place = (cell.double() + 0.5 + self._rowwise("offset").double()) * self.dx
+        cell = 4 * lot.owners[:, :3] - 1 + local
+        place = (cell.double() + 0.5 + lot.rows("offset").double()) * self.dx
         if bool(self.frame.any()):
-            place = place + self.frame * self.time
-        return self._restored(place)
+            place = place + self.frame.to(place.device) * self.time
+        return place
 
     @property
     def body(self) -> Tensor:
         """Velocity field of each point, int32 [N]."""
-        return self._restored(self._owners()[:, 3].to(torch.int32))
+        return self._read("body")
+
+    def _body_of(self, lot: points.Lot) -> Tensor:
+        return lot.owners[:, 3].to(torch.int32)
 
     @property
     def velocity(self) -> Tensor:
         """Velocities [m/s], [N, 3]."""
-        velocity = self._rowwise("velocity")
+        return self._read("velocity")
+
+    def _velocity_of(self, lot: points.Lot) -> Tensor:
+        velocity = lot.rows("velocity")
         if bool(self.frame.any()):
-            velocity = (velocity.double() + self.frame).to(velocity)
-        return self._restored(velocity)
+            velocity = (velocity.double() + self.frame.to(velocity.device)).to(velocity)
+        return velocity
 
     @property
     def affine(self) -> Tensor:
         """APIC matrix C [1/s], [N, 3, 3]."""
-        row = self._words() >> 9
-        return self._restored(self._rowwise("slope") / self._buffers.rows[row, 8, None]).view(
-            -1, 3, 3
-        )
+        return self._read("affine")
+
+    def _affine_of(self, lot: points.Lot) -> Tensor:
+        mass = lot.buffers.rows[lot.words >> 9, 8, None]
+        return (lot.rows("slope") / mass).view(-1, 3, 3)
 
     @property
     def strain(self) -> Tensor:
         """Strain ``b - I``, [N, 6]."""
-        return self._restored(self._rowwise("strain"))
+        return self._read("strain")
 
     @property
     def alpha(self) -> Tensor:
         """Alpha of each point's law, [N]; as given where no law of the scene changes it."""
-        return self._scalar("alpha")
+        return self._read("alpha")
+
+    def _alpha_of(self, lot: points.Lot) -> Tensor:
+        if "alpha" in self._widths:
+            return lot.rows("alpha")[:, 0]
+        if self._alpha is None:
+            return lot.rows("offset").new_zeros(lot.end - lot.begin)
+        return self._alpha[lot.index.to(self._alpha.device)]
 
     @property
     def peak(self) -> Tensor:
         """Largest alpha so far, [N]; -1 for points whose law does not break."""
-        return self._scalar("peak")
+        return self._read("peak")
 
-    def _scalar(self, name: str) -> Tensor:
-        if name in self._unused:
-            return self._unused[name].clone()
-        return self._restored(getattr(self._buffers, name))
+    def _peak_of(self, lot: points.Lot) -> Tensor:
+        if "peak" in self._widths:
+            return lot.rows("peak")[:, 0]
+        return torch.full_like(lot.rows("offset")[:, 0], UNBROKEN)
 
     @property
     def deformation(self) -> Tensor | None:
         """Total deformation gradient, [N, 3, 3], or None when it is not tracked."""
-        if self._buffers.deformation.numel() == 0:
-            return None
-        return self._restored(self._rowwise("deformation")).view(-1, 3, 3)
+        return self._read("deformation") if "deformation" in self._widths else None
+
+    def _deformation_of(self, lot: points.Lot) -> Tensor:
+        return lot.rows("deformation").view(-1, 3, 3)
 
     @property
     def viscous(self) -> Tensor | None:
         """Viscosity of each point with its spring, [N, 9], or None without."""
-        if self._buffers.viscous.numel() == 0:
-            return None
-        return self._restored(self._rowwise("viscous"))
+        return self._read("viscous") if "viscous" in self._widths else None
 
     @property
     def stress(self) -> Tensor:
@@ -401,26 +373,27 @@ class SolverState:
 
         That one belongs to the step, not to the state: it is viscosity times rate of strain.
         """
-        b = self._buffers
-        row = (self._words() >> 9).to(torch.int32)
+        return self._read("stress")
+
+    def _stress_of(self, lot: points.Lot) -> Tensor:
+        b, row = lot.buffers, (lot.words >> 9).to(torch.int32)
         material: Tensor | None = row
-        strain, broken = self._rowwise("strain").contiguous(), self._law_set > 0
-        alpha = b.alpha if broken else strain.new_zeros(self.count)
-        law, params = b.law, b.rows[:, :8].contiguous()
+        strain, broken = lot.rows("strain").contiguous(), self._law_set > 0
+        alpha = lot.rows("alpha")[:, 0] if broken else strain.new_zeros(len(row))
+        law, params, none = b.law, b.rows[:, :8].contiguous(), strain.new_zeros(len(row), 3, 3)
         if broken and (self.irreversible or self._law_set == DAMAGE_FIELD):
-            (law, params), material = weakened(law, params, row, b.peak), None
+            (law, params), material = weakened(law, params, row, lot.rows("peak")[:, 0]), None
         after, new_alpha, stress, _ = return_mapping(
-            strain, alpha, strain.new_zeros(self.count, 3, 3), law=law, params=params,
-            material=material, k=self.k, epsilon=self.epsilon, implicit=self.implicit,
+            strain, alpha, none, law=law, params=params, material=material, k=self.k,
+            epsilon=self.epsilon, implicit=self.implicit,
             dt=1e-9,  # of a step without motion: what flows with a viscosity stays
         )  # fmt: skip
-        if b.viscous.numel():
-            own, none = self._rowwise("viscous"), strain.new_zeros(self.count, 3, 3)
+        if "viscous" in self._widths:
             stress = viscous_step(
-                own, strain, alpha, none, (after, new_alpha, stress), law=b.law,
+                lot.rows("viscous"), strain, alpha, none, (after, new_alpha, stress), law=b.law,
                 params=b.rows[:, :8].contiguous(), material=row, dt=0.0,
             )[3]  # fmt: skip
-        return self._restored(stress)
+        return stress
 
     @property
     def impulse(self) -> Tensor:

@@ -51,6 +51,7 @@ def run_shot(
     unlock: bool = False,
     shared: Path | None = None,
     solids_seed: int | None = None,
+    report: bool = True,
 ) -> dict[str, Any]:
     """Run a shot into a folder.
 
@@ -70,6 +71,7 @@ def run_shot(
             :class:`gsfluent.results.store.StageStore`.
         solids_seed: Seed of the solids, so that runs with other seeds share them; ``seed`` when
             absent.
+        report: Leave ``report.html``.
 
     Returns:
         The content of ``run.json``.
@@ -84,6 +86,7 @@ def run_shot(
         return run_in(
             shot, out, device=device, seed=seed, force=force, reporter=reporter, before=before,
             after=after, facts=facts, plan=plan, shared=shared, solids_seed=solids_seed,
+            report=report,
         )  # fmt: skip
 
 
@@ -101,6 +104,7 @@ def run_in(
     plan: bool = True,
     shared: Path | None = None,
     solids_seed: int | None = None,
+    report: bool = True,
 ) -> dict[str, Any]:
     """:func:`run_shot` in a folder that is locked already."""
     device = torch.device(device)
@@ -171,10 +175,12 @@ def run_in(
             _kept(out, store),
             "run the same command again to go on; GSFLUENT_DEBUG=1 shows the traceback",
         ) from error
-    record.values["outputs"]["report"] = REPORT
+    if report:
+        record.values["outputs"]["report"] = REPORT
     record.values["warnings"] = _warnings(shot, record.values, heard)
     values = record.finish(store.results)
-    write_report(out, values)
+    if report:
+        write_report(out, values)
     reason = (values["simulation"] or {}).get("reason") or values["reason"].split("; ")[0]
     _log.info("%s in %.1f s: %s (%s)", out, time.perf_counter() - start, values["verdict"], reason)
     for warning in values["warnings"]:

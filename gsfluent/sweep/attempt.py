@@ -55,7 +55,8 @@ def attempt(root: str | Path, name: str, function: Function, item: Any) -> str:
             with _spoken_into(folder / LOG):
                 value = function(item, folder)
             row = {"id": name, "value": value, "tries": tries + 1, "host": socket.gethostname()}
-            place.finish(name, folder, row | {"seconds": time.time() - start})
+            row |= {"process": os.getpid(), "began": start, "seconds": time.time() - start}
+            place.finish(name, folder, row)
             return DONE
         except Exception as error:
             place.fail(name, _record(error, folder))

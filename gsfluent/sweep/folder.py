@@ -90,7 +90,10 @@ class SweepFolder:
         return (self.shots / name).exists()
 
     def row(self, name: str) -> dict[str, Any] | None:
-        """The row of a finished task: ``id``, ``value``, ``tries``, ``host``, ``seconds``."""
+        """The row of a finished task.
+
+        It has ``id``, ``value``, ``tries``, ``host``, ``process``, ``began`` and ``seconds``.
+        """
         return read_words(self.shots / name / ROW)
 
     def rows(self, names: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -142,6 +142,7 @@ def run_task(task: Task, folder: Path) -> dict[str, Any]:
             task.shot(), folder, device=common.device, seed=task.seed, plan=False,
             shared=common.shared, solids_seed=common.solids_seed,
             facts={"sweep": {"changes": task.changes, "solids_seed": common.solids_seed}},
+            report=False,  # half a second of a processor; `gsfluent report` makes it of any
         )  # fmt: skip
     except InputError as error:
         reason = str(error)

@@ -5,10 +5,12 @@ python scripts/bench/mpm.py --device cpu --markdown docs/measured/benchmarks.md 
 python scripts/bench/mpm.py --json bench_mpm.json --markdown docs/measured/benchmarks.md
 python scripts/bench/mpm.py --peer peer.json     # from physgaussian.py on the same machine
 python scripts/bench/mpm.py --devices 1 2 4 --rows 200:100 300:136
+python scripts/bench/mpm.py --measured a.json b.json --markdown docs/measured/benchmarks.md
 
 With --profile too: what each GPU does in a step, kernel by kernel.
 With --devices: the elastic scenes on so many GPUs of this host, and whether points end with the
-bits of one. The way of the points to the devices and back is in the time of each 100 steps.
+bits of one: their digests, and up to 25 million points all bits. Points wait in host memory and go
+to the devices some at a time; from 200 million points on runs are of 20 steps.
 
 Scene (shared/spec/baselines.md section 2): domain [0, 2]^3, dx = 2 / n, a cube of m^3 cells with
 eight jittered points each, bottom at four cells, v0 = (0, 0, -3), g = (0, 0, -9.8), rho = 1000,
@@ -79,9 +81,7 @@ def points(n: int, cells: int, order: str, device: torch.device) -> tuple[Tensor
     return x.to(device), dx
 
 
-def build(
-    n: int, cells: int, order: str, kind: str, device: torch.device, **options: Any
-) -> ops.Solver:
+def build(n: int, cells: int, order: str, kind: str, device: torch.device) -> ops.Solver:
     x, dx = points(n, cells, order, device)
     count = x.shape[0]
     young, nu = 1e5, 0.3
@@ -105,7 +105,6 @@ def build(
         law=torch.tensor([law], dtype=torch.int32, device=device), body=body,
         params=torch.tensor([row], device=device), colliders=walls(n, dx, device),
         alpha=torch.full((count,), -0.4, device=device) if law else None, viscous=branch,
-        **options,
     )  # fmt: skip
 
 
@@ -146,27 +145,84 @@ def measure(n: int, cells: int, order: str, kind: str, device: torch.device) -> 
 
 
 STATE = ("position", "velocity", "affine", "strain")
+EXACT = 25_000_000
+"""Points up to which all bits are compared, beside their digests."""
+FEW_STEPS = 200_000_000
+"""Points from which runs are of 20 steps."""
+
+
+def points_on_host(n: int, cells: int) -> Tensor:
+    """The cube's points in host memory, made on a GPU layer by layer."""
+    device, dx = torch.device("cuda:0"), 2.0 / n
+    generator = torch.Generator(device).manual_seed(0)
+    axis, pair = torch.arange(cells, device=device), torch.arange(2, device=device)
+    half = torch.stack(torch.meshgrid(pair, pair, pair, indexing="ij"), -1).reshape(1, 8, 3)
+    low = torch.tensor([1.0 - 0.5 * cells * dx, 1.0 - 0.5 * cells * dx, 4 * dx], device=device)
+    out = torch.empty(cells, 8 * cells**2, 3)
+    for x in range(cells):
+        cell = torch.stack(torch.meshgrid(axis[x : x + 1], axis, axis, indexing="ij"), -1)
+        jitter = torch.rand(cells**2, 8, 3, generator=generator, device=device)
+        place = low + (cell.reshape(-1, 1, 3) + 0.5 * (half + jitter)) * dx
+        out[x] = place.reshape(-1, 3)
+    return out.reshape(-1, 3)
+
+
+def on_devices(x: Tensor, n: int, count: int) -> ops.Solver:
+    """The elastic scene of :func:`build` on so many GPUs, its points from host memory."""
+    dx, young, nu = 2.0 / n, 1e5, 0.3
+    row = [young / (2 * (1 + nu)), young / (3 * (1 - 2 * nu)), 1.85, 0.6, 3.0, 0.0, 1000.0, 0.0]
+    volume = torch.tensor(dx**3 / 8).expand(len(x))
+    return ops.Solver(
+        x, torch.tensor([0.0, 0.0, -3.0]).expand_as(x), (1000.0 * volume[0]).expand(len(x)), volume,
+        dx=dx, dt=1e-4, gravity=(0.0, 0.0, -9.8), law=torch.tensor([0], dtype=torch.int32),
+        params=torch.tensor([row]), colliders=walls(n, dx, torch.device("cpu")),
+        devices=[f"cuda:{i}" for i in range(count)],
+    )  # fmt: skip
+
+
+def digest(solver: ops.Solver, name: str) -> int:
+    """One number of the bits of all points, whichever order they lie in."""
+    total = 0
+    for index, values in solver.chunks(name):
+        rows = values.reshape(len(index), -1).contiguous()
+        words = rows.view(torch.int64 if rows.dtype == torch.float64 else torch.int32).long()
+        for column in range(rows.shape[1]):
+            mixed = (index * 1_000_003 + column + 1) * 0x1B87_3593_9E37_79B1 ^ words[:, column]
+            mixed = (mixed ^ mixed >> 29) * 0x3F58_476D_1CE4_E5B9
+            total += int((mixed ^ mixed >> 32).sum())
+    return total % 2**64
 
 
 def scaling(n: int, cells: int, counts: list[int]) -> list[dict[str, Any]]:
     """One scene on several numbers of devices; the bits of the first are those to have."""
     rows: list[dict[str, Any]] = []
-    want: list[Tensor] = []
+    wanted: list[Any] = []
+    x = points_on_host(n, cells)
+    steps = 20 if len(x) > FEW_STEPS else 100
     for count in counts:
-        devices = [f"cuda:{i}" for i in range(count)]
-        several = {"devices": devices} if count > 1 else {}
-        solver = build(n, cells, "lattice", "elastic", torch.device("cuda:0"), **several)
-        solver.advance(steps=50)
-        times = seconds_per_step(solver, 100, 5)
-        have = [getattr(solver, name).cpu() for name in STATE]
-        want = want or have
+        for i in range(count):
+            torch.cuda.reset_peak_memory_stats(i)
+        start = time.perf_counter()
+        solver = on_devices(x, n, count)
+        loading = time.perf_counter() - start
+        solver.advance(steps=steps // 2)
+        times = seconds_per_step(solver, steps, 5)
+        found: list[Any] = [digest(solver, name) for name in STATE]
+        if solver.count <= EXACT:
+            found += [getattr(solver, name) for name in STATE]
+        wanted = wanted or found
         parts = solver.rank_counts() if count > 1 else []
         rows.append({
             "grid": n, "cells": cells, "particles": solver.count, "devices": count,
             "ms": 1e3 * times[len(times) // 2], "ms_best": 1e3 * times[0],
-            "same_bits": all(torch.equal(a, b) for a, b in zip(have, want, strict=True)),
+            "same_bits": all(
+                torch.equal(a, b) if isinstance(a, Tensor) else a == b
+                for a, b in zip(found, wanted, strict=True)
+            ),
+            "exact": solver.count <= EXACT, "loading": loading,
             "shared": max((part["shared"] for part in parts), default=0),
             "memory_mib": solver.memory() / 2**20,
+            "peak_gb": max(torch.cuda.max_memory_allocated(i) for i in range(count)) / 1e9,
         })  # fmt: skip
         rows[-1]["times"] = rows[0]["ms"] / rows[-1]["ms"]
         sys.stderr.write(f"{json.dumps(rows[-1])}\n")
@@ -178,8 +234,7 @@ def scaling(n: int, cells: int, counts: list[int]) -> list[dict[str, Any]]:
 def profile(n: int, cells: int, count: int) -> str:
     """Microseconds of a step by kernel on each of so many GPUs, and how long each was idle."""
     devices = [f"cuda:{i}" for i in range(count)]
-    several = {"devices": devices} if count > 1 else {}
-    solver = build(n, cells, "lattice", "elastic", torch.device("cuda:0"), **several)
+    solver = on_devices(points_on_host(n, cells), n, count)
     solver.advance(steps=100)
     steps = 100
     kinds = [torch.profiler.ProfilerActivity.CUDA]
@@ -205,16 +260,18 @@ def profile(n: int, cells: int, count: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def scaling_table(name: str, rows: list[dict[str, Any]]) -> str:
+def scaling_table(name: str, rows: list[dict[str, Any]], torch_name: str) -> str:
     lines = [
-        f"Device: {name}; torch {torch.__version__}. Elastic, lattice. Whole steps, with builds.",
+        f"Device: {name}; torch {torch_name}. Elastic, lattice. Whole steps, with builds.",
         "",
-        "| points | devices | ms | times the first | bits of the first | shared blocks |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| points | devices | ms | times the first | bits of the first | shared blocks | "
+        "loading [s] | most memory of one [GB] |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     lines += [
         f"| {r['particles']:,} | {r['devices']} | {r['ms']:.4f} | {r['times']:.2f} | "
-        f"{'yes' if r['same_bits'] else 'no'} | {r['shared']} |"
+        f"{'yes' if r['same_bits'] else 'no'} | {r['shared']} | {r['loading']:.1f} | "
+        f"{r['peak_gb']:.1f} |"
         for r in rows
     ]
     return "\n".join(lines) + "\n"
@@ -261,12 +318,19 @@ def main() -> int:
     parser.add_argument("--peer", type=Path, help="what physgaussian.py wrote")
     parser.add_argument("--devices", nargs="*", type=int, help="numbers of GPUs: 1 2 4")
     parser.add_argument("--profile", action="store_true", help="with --devices: kernel by kernel")
+    parser.add_argument("--measured", type=Path, nargs="*", help="--json of --devices: only enter")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--markdown", type=Path)
     options = parser.parse_args()
     if options.peer:
         for row in json.loads(options.peer.read_text())["rows"]:
             PEER[row["grid"], row["cells"], row["order"]] = round(row["ms"], 3)
+    if options.measured:
+        found = [json.loads(path.read_text()) for path in options.measured]
+        rows = [row for one in found for row in one["rows"]]
+        name, torch_name = found[0]["device"], found[0].get("torch", torch.__version__)
+        table = scaling_table(name, rows, torch_name)
+        return leave(options, "bench_mpm devices", table, name, rows)
     if options.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
     gpu = options.device == "cuda" or (options.device == "auto" and has_cuda())
@@ -287,7 +351,8 @@ def main() -> int:
         if options.profile:
             return 0
         name = torch.cuda.get_device_name()
-        return leave(options, "bench_mpm devices", scaling_table(name, rows), name, rows)
+        table = scaling_table(name, rows, torch.__version__)
+        return leave(options, "bench_mpm devices", table, name, rows)
     default = ["100:24", "200:50", "200:80", "300:100"] if gpu else ["100:24"]
     rows = []
     for text in options.rows or default:
@@ -315,7 +380,9 @@ def leave(
     """Print the table; write it and the rows to where they were asked for."""
     sys.stdout.write(text)
     if options.json:
-        options.json.write_text(json.dumps({"device": name, "rows": rows}, indent=1) + "\n")
+        options.json.write_text(
+            json.dumps({"device": name, "torch": torch.__version__, "rows": rows}, indent=1) + "\n"
+        )
     if options.markdown:
         page = options.markdown
         old = page.read_text() if page.exists() else ""

@@ -106,7 +106,7 @@ def test_what_is_saved_goes_on_as_it_would_have() -> None:
 def test_room_for_blocks_grows_while_it_cracks() -> None:
     given = on("cuda", plates(torch.float32))
     tight = ops.Solver(**given, dt=DT)
-    tight._buffers.reserve_blocks(int(tight.clock()["homes"]), 3, 1)
+    tight._whole.reserve_blocks(int(tight.clock()["homes"]), 3, 1)
     tight.advance(steps=40)
     assert torch.equal(tight.peak, run(given, 40).peak)
 

@@ -169,9 +169,9 @@ def test_two_threads_give_the_bits_of_one(two_threads: None) -> None:
 def test_room_for_blocks_grows_without_a_trace() -> None:
     given = small("all", torch.float32)
     tight = ops.Solver(**given, dt=DT)
-    tight._buffers.reserve_blocks(int(tight.clock()["homes"]), 1, 2)
+    tight._whole.reserve_blocks(int(tight.clock()["homes"]), 1, 2)
     tight.advance(steps=STEPS)
-    assert tight._buffers.slot_next.shape[0] > 1
+    assert tight._whole.slot_next.shape[0] > 1
     assert_same_bits(tight, resident(given, DT, STEPS), slice(None))
 
 
@@ -261,7 +261,7 @@ def test_momentum_is_conserved() -> None:
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
 def test_a_velocity_that_is_no_speed_stops_the_solver(value: float) -> None:
     solver = ops.Solver(**small("elastic", torch.float32), dt=DT)
-    solver._buffers.velocity[5, 0] = value
+    solver._whole.velocity[5, 0] = value
     with pytest.raises(ops.SolverError, match="not finite"):
         solver.advance(steps=10)
 
@@ -284,7 +284,7 @@ def test_wild_state_words_are_not_followed() -> None:
     """Cells, rows and indices that no build made: an error or a stop, never a wild address."""
     for name in ("meta", "home_start0", "home_start1", "home_count1", "neighbour", "site_slots"):
         solver = resident(small("two bodies"), DT, 2)
-        wild = getattr(solver._buffers, name)
+        wild = getattr(solver._whole, name)
         wild.view(-1)[::3] = torch.iinfo(torch.int32).max
         try:
             solver.advance(steps=40)

@@ -86,7 +86,7 @@ def test_a_time_is_met_exactly_and_a_frame_may_be_cut_in_two() -> None:
 def test_room_for_blocks_grows() -> None:
     given = scene(dtype=torch.float32, device="cuda")
     tight = ops.Solver(**given, dt=DT)
-    tight._buffers.reserve_blocks(int(tight.clock()["homes"]), 3, 1)
+    tight._whole.reserve_blocks(int(tight.clock()["homes"]), 3, 1)
     tight.advance(steps=STEPS)
     loose = resident(given, DT, STEPS)
     assert torch.equal(tight.position, loose.position)
@@ -95,7 +95,7 @@ def test_room_for_blocks_grows() -> None:
 def test_bad_states_stop_with_a_reason() -> None:
     given = scene(dtype=torch.float32, device="cuda")
     solver = ops.Solver(**given, dt=DT)
-    solver._buffers.velocity[4 * 5] = float("nan")
+    solver._whole.velocity[4 * 5] = float("nan")
     with pytest.raises(ops.SolverError, match="not finite"):
         solver.advance(steps=10)
     fast = ops.Solver(**given, dt=0.05)

@@ -15,7 +15,7 @@ from gsfluent import ops
 from gsfluent.errors import GsfluentError, InputError
 from gsfluent.lab.world.shapes import parameters
 from gsfluent.ops import solver_buffers as layout
-from gsfluent.ops import solver_ranks
+from gsfluent.ops import solver_points, solver_ranks
 from gsfluent.ops.plasticity import PHASE_CODES
 
 DTYPES = [torch.float32, torch.float64]
@@ -272,7 +272,7 @@ def test_room_for_blocks_grows_and_going_back_leave_no_trace() -> None:
     given = small("two bodies", torch.float32)
     one = run(given, 1)
     tight = ops.Solver(**given, ranks=3)
-    tight._buffers.reserve_blocks(int(tight.clock()["homes"]), 1, 2)
+    tight._whole.reserve_blocks(int(tight.clock()["homes"]), 1, 2)
     start = tight.snapshot()
     for _ in range(2):
         tight.advance(steps=STEPS)
@@ -349,7 +349,7 @@ def test_a_device_that_does_not_answer_is_an_error(
 ) -> None:
     solver = ops.Solver(**small("elastic"))
     parts = object.__new__(solver_ranks.Parts)
-    parts.whole, parts.devices = solver._buffers, (torch.device("cuda:0"), torch.device("cuda:1"))
+    parts.whole, parts.devices = solver._whole, (torch.device("cuda:0"), torch.device("cuda:1"))
     event = MagicMock()
     event.query.side_effect = itertools.repeat(answer) if answer is False else answer
     monkeypatch.setattr(torch.cuda, "Event", lambda: event)
@@ -365,26 +365,93 @@ def test_nothing_is_cut_before_a_step() -> None:
         ops.Solver(**small("elastic"), ranks=2).rank_counts()
 
 
+@pytest.mark.parametrize("name", ["free", "two bodies", "relaxing", "flip", "objects"])
+def test_points_that_come_and_go_some_at_a_time_keep_the_bits(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = CASES[name](torch.float32)
+    whole = [run(given, ranks) for ranks in (1, 3)]
+    monkeypatch.setattr(layout, "CHUNK", 37)
+    for ranks, want in zip((1, 3), whole, strict=True):
+        some = ops.Solver(**given, ranks=ranks)
+        assert torch.equal(some._whole.id, ops.Solver(**given)._whole.id)
+        some.advance(steps=STEPS)
+        assert_equal(some, want)
+        for value in ("position", "body", "stress", "alpha", "peak"):
+            assert torch.equal(getattr(some, value), getattr(want, value)), value
+    seen = torch.cat([index for index, _ in some.chunks("position")])
+    assert torch.equal(seen.sort().values, torch.arange(some.count))
+    with pytest.raises(InputError, match="there is no 'colour' here"):
+        next(some.chunks("colour"))
+
+
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_each_device_gets_a_stretch_of_points_from_host_memory(
+    dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ranks on CUDA hold them, in planes, but on a CPU, where nothing steps them."""
+    monkeypatch.setattr(layout, "CHUNK", 100)
+    given = relaxing(dtype) | {"frame": (0.25, 0.0, -0.5), "colliders": None}
+    want = ops.Solver(**given)
+    solver = ops.Solver(**given)
+    n, cpu = solver.count, torch.device("cpu")
+    widths = {name: width for name, width in layout.ON_DEVICE.items() if name in want._widths}
+    solver._widths = widths | layout.SCRATCH
+    solver._whole.reserve_points(want._widths, 0)
+    solver._whole.meta = solver._whole.slope = solver._whole.meta.new_zeros(0)
+    parts = solver_ranks.Parts(
+        solver._whole, [cpu] * 4, solver.fields, solver._widths, *solver._settings()
+    )
+    solver._parts = parts
+    more = {name: given[name] for name in ("strain", "alpha", "viscous", "peak", "deformation")
+            if given.get(name) is not None}  # fmt: skip
+    rows = (want._rows(given.get("material"), given["mass"], given["volume"]))[0]
+    solver._load(solver_points.Given(
+        given["position"], given["velocity"], given["mass"], rows, given.get("body"), more,
+        solver.frame, solver.dx,
+    ))  # fmt: skip
+    assert solver._whole.id.numel() == 0
+    assert all(n / 4 <= part.id.numel() < 0.3 * n + 100 for part in parts.parts)
+    assert [int(part.clock[layout.INDEX["homes"]]) for part in parts.parts] == [
+        int((part.home_count0 > 0).sum()) for part in parts.parts
+    ]
+    for name in (*STATE, "viscous", "alpha", "peak", "body", "stress"):
+        value = getattr(want, name)
+        assert value is None or torch.equal(getattr(solver, name), value), name
+    saved = solver.snapshot()
+    for part in parts.parts:
+        part.reserve_points(solver._widths, n)
+        part.velocity.zero_()
+    solver.restore(saved)
+    assert torch.equal(solver.velocity, want.velocity)
+
+
 def test_room_for_more_points_keeps_those_that_are_there() -> None:
     for width in (1, 4, 6, 9, 12):
         values = torch.arange(7 * width, dtype=torch.float32).view(7, width)
+        flat, order = torch.zeros(7 * width), torch.randperm(7)
+        layout.put_rows(flat, width, order, values[order])
         for count in (9, 7, 5):
-            room = layout.more_room(layout.planes(values), width, count)
+            room = layout.more_room(flat, width, count)
             kept = min(7, count)
-            assert torch.equal(layout.from_planes(room, width)[:kept], values[:kept])
+            assert torch.equal(layout.get_rows(room, width, 0, kept), values[:kept])
 
 
 def test_each_rank_has_room_for_its_share_and_gets_what_it_wants() -> None:
     """On a device the clock of a rank says how many points and homes a cut would give it."""
     solver = ops.Solver(**small("two bodies", torch.float32))
-    whole, n = solver._buffers, solver.count
-    for name, width in (("offset", 4), ("velocity", 12), ("strain", 6)):
-        setattr(whole, name, torch.zeros(width * n))  # as a device lays them out
-    cpu = torch.device("cpu")
-    parts = solver_ranks.Parts(whole, [cpu] * 4, solver.fields, *solver._settings())
-    assert whole.spare.numel() == 0
-    assert all(n / 4 <= part.id.numel() < 0.3 * n + 100 for part in parts.parts)
-    assert sum(part.home_start0.numel() for part in parts.parts) < 4 * whole.home_start0.numel()
+    whole, n, cpu = solver._whole, solver.count, torch.device("cpu")
+    widths = {"id": 1, "offset": 4, "velocity": 12, "strain": 6} | layout.SCRATCH
+    for name in ("id", "offset", "velocity", "strain", "spare"):
+        setattr(whole, name, getattr(whole, name).new_zeros(0))
+    parts = solver_ranks.Parts(whole, [cpu] * 4, solver.fields, widths, *solver._settings())
+    homes = int(solver.clock()["homes"])
+    for part in parts.parts:
+        part.reserve_points(widths, parts.room(n // 4))
+    parts.reserve(homes, [homes // 4, homes // 4, 200, 0])
+    assert all(n // 4 <= part.id.numel() < 0.3 * n + 100 for part in parts.parts)
+    assert parts.parts[2].home_start0.numel() == 200  # listed, though not its share
+    assert parts.parts[3].home_start0.numel() < 100
     first, second = parts.parts[:2]
     first.id += 7
     clock = first.clock

@@ -7,11 +7,12 @@ from typing import Any
 import pytest
 import torch
 from solver_scenes import scene
-from test_solver_cpu import shuffled, small
+from test_solver_cpu import STATE, shuffled, small
 from test_solver_ranks import CASES, DTYPES, assert_same_state, dust
 
 from gsfluent import has_cuda, ops
 from gsfluent.errors import GsfluentError, InputError
+from gsfluent.ops import solver_buffers as layout
 from gsfluent.ops import solver_ranks
 
 pytestmark = [
@@ -111,7 +112,7 @@ def test_order_of_points_and_room_for_blocks_leave_no_trace() -> None:
     assert torch.equal(several.impulse, one.impulse)
     tight = ops.Solver(**here(given), ranks=3)
     homes = int(tight.clock()["homes"])
-    tight._buffers.reserve_blocks(homes, 1, 2)
+    tight._whole.reserve_blocks(homes, 1, 2)
     tight._parts.grow()
     start = tight.snapshot()
     for _ in range(2):
@@ -129,7 +130,7 @@ def test_a_time_is_met_in_one_call_or_in_two() -> None:
         assert_equal(several, one)
 
 
-def test_points_stay_with_their_ranks_until_somebody_looks() -> None:
+def test_points_stay_with_their_ranks_from_call_to_call() -> None:
     given = here(CASES["bullet"](torch.float32))
     one, several = ops.Solver(**given), ops.Solver(**given, ranks=3)
     for solver in (one, several):
@@ -139,9 +140,25 @@ def test_points_stay_with_their_ranks_until_somebody_looks() -> None:
         slower[:, 10:13] *= 0.5
         solver.set_colliders(slower)
         solver.advance(steps=10)
-    assert several._parts.away
     assert_equal(several, one)
-    assert not several._parts.away
+    assert several._whole.id.numel() == several._whole.offset.numel() == 0
+
+
+@pytest.mark.parametrize("name", ["free", "two bodies", "relaxing", "flip", "objects"])
+def test_points_come_from_host_memory_some_at_a_time(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = CASES[name](torch.float32)
+    one = run(here(given))
+    monkeypatch.setattr(layout, "CHUNK", 61)
+    for where in (["cuda:0"], ["cuda:0"] * 3):
+        several = run(given, devices=where)
+        assert not several.position.is_cuda
+        for value in (*STATE, "body", "stress"):
+            want = getattr(one, value)
+            assert want is None or torch.equal(getattr(several, value), want.cpu()), value
+        assert several.counters() == one.counters()
+        assert all(index.is_cuda for index, _ in several.chunks("position"))
 
 
 def test_each_rank_has_memory_for_its_share_and_grows_where_points_gather() -> None:
@@ -149,18 +166,14 @@ def test_each_rank_has_memory_for_its_share_and_grows_where_points_gather() -> N
     one, several = run(given), run(given, ranks=4)
     room = [part.id.numel() for part in several._parts.parts]
     assert sum(room) < 1.3 * one.count and max(room) < 0.3 * one.count
-    assert several._whole.offset.numel() == 0  # while the points are away
     # All points drift into the share of one rank: what lies there is too small and grows.
     for part in several._parts.parts:
-        for name, width in (*several._parts._used.items(), *solver_ranks._SCRATCH.items()):
-            held = int(part.clock[solver_ranks.layout.INDEX["cursor"]])
-            setattr(part, name, solver_ranks.layout.more_room(getattr(part, name), width, held))
+        part.reserve_points(several._widths, int(part.clock[layout.INDEX["cursor"]]))
     before = [part.id.numel() for part in several._parts.parts]
     for solver in (one, several):
         solver.advance(steps=200)
     assert_equal(several, one)
     assert [part.id.numel() for part in several._parts.parts] != before
-    assert several._whole.offset.numel() > 0
 
 
 def test_the_same_failure_at_the_same_step() -> None:

@@ -181,7 +181,7 @@ def test_solids_are_made_once_and_the_seed_moves_only_what_comes_after(
     monkeypatch.setattr("gsfluent.stages.chain.simulate_stage", simulated)
     for stage in ("render_stage", "export_stage"):
         monkeypatch.setattr(f"gsfluent.stages.chain.{stage}", lambda context: None)
-    for name in ("check_shot", "write_report", "foresee_run", "judge_plan"):
+    for name in ("check_shot", "foresee_run", "judge_plan"):
         monkeypatch.setattr(f"gsfluent.run.shot.{name}", lambda *given, **named: None)
     found = tasks(place, vary={"seed": [3, 4]})
     make_shared_solids(found[0], place / "solids")
@@ -190,6 +190,8 @@ def test_solids_are_made_once_and_the_seed_moves_only_what_comes_after(
     assert [line["seed"] for line in lines] == [3, 4]
     record = json.loads((place / found[0].id / "run.json").read_text())
     assert record["sweep"] == {"changes": {}, "solids_seed": 0}
+    assert not (place / found[0].id / "report.html").exists()  # `gsfluent report` makes one
+    assert "report" not in record["outputs"]
     film = dataclasses.replace(found[0].common, keep="film")
     run_task(dataclasses.replace(found[0], common=film), place / "film")
     assert not (place / "film" / "stages").exists()

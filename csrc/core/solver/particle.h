@@ -270,11 +270,30 @@ GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T
       shared_stress(out.stress, kirchhoff_stress(row[0], row[1], spring.d, spring.j2m1), share);
 }
 
+#ifdef __CUDACC__
+// In double, which is for comparisons, kernels call the laws: one copy for all of a file.
+template <typename T, bool kMore, bool kField>
+GSF_HOST_DEVICE_COLD ReturnMapped<T> called_law(const Sym3<T>& strain, T alpha,
+                                                const Mat3<T>& increment, int law,
+                                                const MaterialRow<T>& m, const NaccOptions<T>& o,
+                                                T dt) {
+  if constexpr (kMore)
+    return return_mapping_more(strain, alpha, increment, law, m, o, dt);
+  else
+    return return_mapping<kField>(strain, alpha, increment, law, m, o, dt);
+}
+#endif
+
 // The maps of the laws that a kernel is compiled for.
 template <typename T, int kLaws>
 GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
                                          int law, const MaterialRow<T>& m, const NaccOptions<T>& o,
                                          T dt) {
+#ifdef __CUDACC__
+  if constexpr (sizeof(T) == sizeof(double))
+    return called_law<T, kLaws == kMoreLaws, kLaws == kDamageField>(strain, alpha, increment, law,
+                                                                    m, o, dt);
+#endif
   if constexpr (kLaws == kMoreLaws)
     return return_mapping_more(strain, alpha, increment, law, m, o, dt);
   else
@@ -334,7 +353,8 @@ GSF_HOST_DEVICE bool measures_waves(const SolverClock& c, int laws) {
 // Update of particle p from what it gathered (value = sum w v_i, first = sum w v_i (node - f), in
 // cells): velocity, C, position, deformation, strain by its law, and the slope for the next step.
 // `reach` is that of its home: a particle that would touch a block out of reach asks for new ones.
-// kKeeps: with keep_own, and `before` holds what leave_share left.
+// kTrack: with the deformation, where there is one. kKeeps: with keep_own, and `before` holds what
+// leave_share left.
 template <typename T, int kLaws, bool kTrack, bool kKeeps = false>
 GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
                                           ParticleBefore<T>& before, uint32_t reach, const T* value,
@@ -356,7 +376,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
   }
   store_place(s, p, o, pack_meta(l[0], l[1], l[2], meta_row(meta)));
 
-  if constexpr (kTrack) {
+  if (kTrack && s.deformation != nullptr) {
     Mat3<T> f;
     load_nine(s, s.deformation, p, f.m);
     f = f + dt * matmul(c, f);

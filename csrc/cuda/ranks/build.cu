@@ -1,7 +1,7 @@
-// Builds of several ranks, and points on their way to and from them. The view of all makes the
-// lists of blocks from what the ranks' points need; each rank then takes its share of them and
-// fetches the points of its homes from wherever they lie. Kernels read and write what lies on other
-// devices as if it were their own; between such phases all wait for all (Fleet::meet).
+// Builds of several ranks. The view of all makes the lists of blocks from what the ranks' points
+// need; each rank then takes its share of them and fetches the points of its homes from wherever
+// they lie. Kernels read and write what lies on other devices as if it were their own; between such
+// phases all wait for all (Fleet::meet).
 #include "cuda/ranks/ranks.h"
 #include "cuda/solver/build.h"
 
@@ -10,12 +10,6 @@ namespace {
 
 constexpr int kCutThreads = 1024;
 constexpr int kBins = 4096;  // of the order of homes along the longest axis
-
-// Homes that a build makes, or those that there are.
-template <typename T>
-__device__ const HomeList<T>& homes_of(const SolverView<T>& s, bool build) {
-  return build ? s.next_homes() : s.homes();
-}
 
 // What the points of a rank need joins what those of the others do. A point's place in its home
 // follows those of the ranks that were there first.
@@ -44,12 +38,11 @@ __global__ void __launch_bounds__(kThreads) join_kernel(const __grid_constant__ 
 // each home. Each has about as many points. If one has no room for its share, all stop before
 // anything has changed, and the clocks of the ranks say what they want. One CTA.
 template <typename T>
-__global__ void __launch_bounds__(kCutThreads)
-    cut_kernel(const __grid_constant__ SolverView<T> s, bool build) {
+__global__ void __launch_bounds__(kCutThreads) cut_kernel(const __grid_constant__ SolverView<T> s) {
   SolverClock& clock = *s.clock;
-  if (build && !may_build(clock)) return;
-  const HomeList<T>& homes = homes_of(s, build);
-  const int64_t count = build ? clock.wanted_homes : clock.homes;
+  if (!may_build(clock)) return;
+  const HomeList<T>& homes = s.next_homes();
+  const int64_t count = clock.wanted_homes;
   __shared__ int low[3], high[3];
   __shared__ int filled[kBins], sums[kCutThreads];
   __shared__ int points_of[kMostRanks], homes_of_rank[kMostRanks];
@@ -134,45 +127,38 @@ __global__ void __launch_bounds__(kCutThreads)
   }
 }
 
-// A rank hears how the build went and has no homes yet; or the clock of all, and keeps its homes.
+// A rank begins with the clock of all and its own homes.
+template <typename T>
+__global__ void begin_kernel(const __grid_constant__ SolverView<T> s,
+                             const __grid_constant__ SolverView<T> all) {
+  SolverClock now = *all.clock;
+  now.homes = s.clock->homes;
+  now.slots = s.clock->slots;
+  now.cursor = s.clock->cursor;
+  now.plastic = now.guarded = now.inverted = now.invalid = 0;
+  *s.clock = now;
+}
+
+// A rank hears how the build went and has no homes yet.
 template <typename T>
 __global__ void hear_kernel(const __grid_constant__ SolverView<T> s,
-                            const __grid_constant__ SolverView<T> all, bool build) {
+                            const __grid_constant__ SolverView<T> all) {
   SolverClock& c = *s.clock;
-  if (!build) {
-    if (all.clock->grow != 0) {  // nothing is loaded; what this rank wants stands in its clock
-      c.grow = 1;
-      return;
-    }
-    SolverClock now = *all.clock;
-    now.homes = c.homes;
-    now.slots = c.slots;
-    now.cursor = c.cursor;
-    now.plastic = now.guarded = now.inverted = now.invalid = 0;
-    c = now;
-    return;
-  }
   if (!may_build(c)) return;
   c.grow = all.clock->grow;
   c.reason = all.clock->reason;
-  if (c.grow != 0) return;  // likewise
+  if (c.grow != 0) return;  // what this rank wants stands in its clock
   c.wanted_homes = c.wanted_slots = c.cursor = c.shared_sites = c.shared_homes = 0;
-}
-template <typename T>
-__global__ void empty_kernel(const __grid_constant__ SolverView<T> s) {
-  if (s.clock->grow == 0) s.clock->wanted_homes = s.clock->cursor = s.clock->slots = 0;
 }
 
 // The homes that a rank owns.
 template <typename T>
-__global__ void __launch_bounds__(kThreads)
-    take_kernel(const __grid_constant__ SolverView<T> s, const __grid_constant__ SolverView<T> all,
-                bool build) {
-  if (build ? !may_build(*s.clock) : s.clock->grow != 0) return;
+__global__ void __launch_bounds__(kThreads) take_kernel(const __grid_constant__ SolverView<T> s,
+                                                        const __grid_constant__ SolverView<T> all) {
+  if (!may_build(*s.clock)) return;
   const int64_t h = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int64_t count = build ? all.clock->wanted_homes : all.clock->homes;
-  if (h >= count || all.home_rank[h] != s.rank) return;
-  const HomeList<T>&from = homes_of(all, build), &to = homes_of(s, build);
+  if (h >= all.clock->wanted_homes || all.home_rank[h] != s.rank) return;
+  const HomeList<T>&from = all.next_homes(), &to = s.next_homes();
   const int32_t points = from.count[h];
   const int64_t own = static_cast<int64_t>(add(&s.clock->wanted_homes, 1));
   const int64_t start = static_cast<int64_t>(add(&s.clock->cursor, points));
@@ -180,30 +166,6 @@ __global__ void __launch_bounds__(kThreads)
   to.start[own] = static_cast<int32_t>(start);
   to.count[own] = points;
   all.home_place[h] = static_cast<int32_t>(start);
-}
-
-// The points of one home of all, one CTA each: to the rank that owns it, or back from it.
-template <typename T, bool kBack>
-__global__ void __launch_bounds__(kThreads)
-    fetch_kernel(const __grid_constant__ SolverView<T> s,
-                 const __grid_constant__ SolverView<T> all) {
-  const int64_t h = blockIdx.x;
-  if (all.clock->grow != 0 || h >= all.clock->homes || all.home_rank[h] != s.rank) return;
-  const int64_t first = all.homes().start[h], place = all.home_place[h];
-  for (int pass = kPlacePass; pass <= kOwnPass; ++pass) {
-    if (pass >= kDeformationPass && nine_of(s, pass) == nullptr) continue;
-    for (int64_t r = threadIdx.x; r < all.homes().count[h]; r += kThreads)
-      for_pass(s, all, pass, [&](auto* own, auto* of_all) {
-        if constexpr (kBack)
-          of_all[first + r] = own[place + r];
-        else
-          own[place + r] = of_all[first + r];
-      });
-  }
-}
-template <typename T>
-__global__ void loaded_kernel(const __grid_constant__ SolverView<T> s) {
-  if (s.clock->grow == 0) s.clock->homes = s.clock->wanted_homes;
 }
 
 // As place_kernel: where each point of a rank goes, rank and place in one word.
@@ -329,26 +291,16 @@ __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ 
 }  // namespace
 
 template <typename T>
-cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set, bool load) {
+cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set) {
   const SolverView<T>& all = fleet.all();
-  const unsigned homes = static_cast<unsigned>(all.home_capacity);
   cudaError_t error = cudaSuccess;
   const auto meet = [&] {
     const cudaError_t met = fleet.meet();
     if (error == cudaSuccess) error = met;
   };
-  if (load)
-    fleet.of_all([&](const SolverView<T>& s, cudaStream_t stream) {
-      cut_kernel<T><<<1, kCutThreads, 0, stream>>>(s, false);
-    });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    hear_kernel<T><<<1, 1, 0, stream>>>(s, all, false);
-    if (!load) return;
-    empty_kernel<T><<<1, 1, 0, stream>>>(s);
-    take_kernel<T><<<ctas(homes), kThreads, 0, stream>>>(s, all, false);
-    loaded_kernel<T><<<1, 1, 0, stream>>>(s);
-    fetch_kernel<T, false><<<homes, kThreads, 0, stream>>>(s, all);
+    begin_kernel<T><<<1, 1, 0, stream>>>(s, all);
   });
   for (const bool measure : {true, false}) {
     fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
@@ -362,18 +314,6 @@ cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set, bool load) {
     fleet.of_all(start);
     meet();
   }
-  return error == cudaSuccess ? cudaGetLastError() : error;
-}
-
-template <typename T>
-cudaError_t ranks_gather(const Fleet<T>& fleet) {
-  const SolverView<T>& all = fleet.all();
-  const unsigned homes = static_cast<unsigned>(all.home_capacity);
-  cudaError_t error = fleet.meet();
-  fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    fetch_kernel<T, true><<<homes, kThreads, 0, stream>>>(s, all);
-  });
-  if (error == cudaSuccess) error = fleet.meet();
   return error == cudaSuccess ? cudaGetLastError() : error;
 }
 
@@ -409,13 +349,13 @@ cudaError_t ranks_build(const Fleet<T>& fleet) {
     sites_kernel<T><<<table, kThreads, 0, stream>>>(s);
     if (s.moments != nullptr)
       edges_kernel<T><<<ctas(s.slot_capacity * kNeighbours), kThreads, 0, stream>>>(s);
-    cut_kernel<T><<<1, kCutThreads, 0, stream>>>(s, true);
+    cut_kernel<T><<<1, kCutThreads, 0, stream>>>(s);
     free_kernel<T><<<slots, kThreads, 0, stream>>>(s);
   });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
-    hear_kernel<T><<<1, 1, 0, stream>>>(s, all, true);
-    take_kernel<T><<<homes_of_all, kThreads, 0, stream>>>(s, all, true);
+    hear_kernel<T><<<1, 1, 0, stream>>>(s, all);
+    take_kernel<T><<<homes_of_all, kThreads, 0, stream>>>(s, all);
   });
   meet();
   fleet.each([&](const SolverView<T>& s, cudaStream_t stream) {
@@ -487,10 +427,9 @@ cudaError_t ranks_step(const Fleet<T>& fleet, int law_set) {
   return error == cudaSuccess ? cudaGetLastError() : error;
 }
 
-#define GSF_INSTANTIATE(T)                                         \
-  template cudaError_t ranks_prime<T>(const Fleet<T>&, int, bool); \
-  template cudaError_t ranks_gather<T>(const Fleet<T>&);           \
-  template cudaError_t ranks_build<T>(const Fleet<T>&);            \
+#define GSF_INSTANTIATE(T)                                   \
+  template cudaError_t ranks_prime<T>(const Fleet<T>&, int); \
+  template cudaError_t ranks_build<T>(const Fleet<T>&);      \
   template cudaError_t ranks_step<T>(const Fleet<T>&, int);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)

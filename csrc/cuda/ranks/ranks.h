@@ -1,8 +1,8 @@
 // One scene on several ranks on CUDA devices, one each or several on one (docs/theory/ranks.md).
 //
 // A rank has its points, its homes and its node values for itself, and a copy of the lists of
-// blocks, in which slots and sites have the same numbers everywhere. The view of all, on the device
-// of the caller, makes those lists at a build and holds the points between two calls.
+// blocks, in which slots and sites have the same numbers everywhere. The view of all, on the first
+// device, has no points; it makes those lists at a build.
 //
 // Sums of nodes are whole numbers, so whoever adds to a node that others hold too adds to theirs as
 // well, in whatever order. After that, and after a step, all wait for all; then each rank reads
@@ -96,13 +96,9 @@ struct Fleet {
   }
 };
 
-// Starts the clocks as that of all says, and takes the stress of the first step into the slopes;
-// before that (load) the points of all go to the ranks.
+// Starts the clocks as that of all says, and takes the stress of the first step into the slopes.
 template <typename T>
-cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set, bool load);
-// The points go back.
-template <typename T>
-cudaError_t ranks_gather(const Fleet<T>& fleet);
+cudaError_t ranks_prime(const Fleet<T>& fleet, int law_set);
 // Builds blocks when the clock asks for them, and cuts anew.
 template <typename T>
 cudaError_t ranks_build(const Fleet<T>& fleet);

@@ -236,14 +236,9 @@ struct SolverCuda {
   static constexpr bool kHasRanks = false;
   template <typename T>
   static void prime_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,
-                          int law_set, bool load) {
+                          int law_set) {
     const Ranks<T> ranks(std::move(views), like);
-    check_cuda("solver_prime_ranks", cuda::ranks_prime(ranks.fleet(), law_set, load));
-  }
-  template <typename T>
-  static void gather_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like) {
-    const Ranks<T> ranks(std::move(views), like);
-    check_cuda("solver_gather_ranks", cuda::ranks_gather(ranks.fleet()));
+    check_cuda("solver_prime_ranks", cuda::ranks_prime(ranks.fleet(), law_set));
   }
   template <typename T>
   static void run_ranks(std::vector<SolverView<T>> views, const std::vector<Tensor>& like,

@@ -17,6 +17,7 @@ import argparse
 import json
 import os
 import shutil
+import statistics
 import time
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ import yaml
 import gsfluent as gf
 from gsfluent.cli.common import choose_device
 from gsfluent.figure.markdown import enter
-from gsfluent.hardware import graphics_cards, processor
+from gsfluent.hardware import Load, graphics_cards, processor
 from gsfluent.io import save_splats
 from gsfluent.progress import LineReporter
 from gsfluent.sweep import read_sweep, run_sweep
@@ -57,15 +58,46 @@ def sweep_file(folder: Path, seeds: list[int], seconds: float, pack: int, device
     return folder / "sweep.yaml"
 
 
-def timed(file: Path, out: Path, device: torch.device, jobs: int) -> float:
-    """Seconds that a sweep takes whose solids are there."""
-    start = time.perf_counter()
+def timed(file: Path, out: Path, device: torch.device, jobs: int) -> dict[str, Any]:
+    """How long a sweep takes whose solids are there, and what its processes did meanwhile."""
+    start, before = time.time(), Load.now()
     said = run_sweep(
         read_sweep(file, {}, None), out, device=device, jobs=jobs, reporter=LineReporter()
     )
     if not said["ok"] or "failed" in said["verdicts"]:
         raise SystemExit(f"packing.py: {said}")
-    return time.perf_counter() - start
+    return where_time_goes(out, start, before)
+
+
+def where_time_goes(out: Path, start: float, before: Load) -> dict[str, Any]:
+    """Seconds of a sweep that has just ended: start, first and later shots, stages, idle cores."""
+    now, end = Load.now(), time.time()
+    place = SweepFolder(out)
+    names = sorted(place.done())
+    rows = sorted(place.rows(names).values(), key=lambda row: float(row["began"]))
+    seen: set[int] = set()
+    first: list[float] = []
+    later: list[float] = []
+    for row in rows:
+        (later if row["process"] in seen else first).append(float(row["seconds"]))
+        seen.add(row["process"])
+    stages: dict[str, list[float]] = {}
+    for name in names:
+        record = json.loads((place.shots / name / "run.json").read_text())
+        for stage in record["stages"]:
+            stages.setdefault(stage["name"], []).append(float(stage["seconds"]))
+    busy = None if now.busy is None or before.busy is None else now.busy - before.busy
+    return {
+        "wall": end - start,
+        "processes": len(seen),
+        "until_first": rows[0]["began"] - start,
+        "until_all": max(r["began"] for r in rows[: len(seen)]) - start,
+        "after_last": end - max(row["began"] + row["seconds"] for row in rows),
+        "first_shot": statistics.mean(first),
+        "later_shot": statistics.mean(later) if later else None,
+        "stages": {name: statistics.mean(found) for name, found in stages.items()},
+        "busy_cores": None if busy is None else busy / (now.at - before.at),
+    }
 
 
 def figures(out: Path) -> dict[int, Any]:
@@ -87,8 +119,8 @@ def prepare(options: argparse.Namespace, device: torch.device) -> Path:
 
 def swept(
     options: argparse.Namespace, device: torch.device, first: Path, name: str, pack: int, jobs: int
-) -> tuple[float, dict[int, Any]]:
-    """Seconds that all shots take, so many at a time, and their figures."""
+) -> tuple[dict[str, Any], dict[int, Any]]:
+    """How long all shots take, so many at a time, and their figures."""
     out = options.out / name
     shutil.rmtree(out, ignore_errors=True)
     for part in ("stages", "solids"):
@@ -106,41 +138,50 @@ def spread(options: argparse.Namespace) -> list[dict[str, Any]]:
     for count in options.gpus:
         os.environ["CUDA_VISIBLE_DEVICES"] = ",".join(cards[:count])  # for the processes
         jobs = options.pack * count
-        wall, found = swept(options, device, first, f"gpus_{count}", options.pack, jobs)
+        times, found = swept(options, device, first, f"gpus_{count}", options.pack, jobs)
         wanted = wanted or found
         rows.append({
             "device": torch.cuda.get_device_name(device), "cores": os.cpu_count(), "gpus": count,
-            "shots": options.shots, "pack": options.pack, "wall": wall,
-            "same_figures": found == wanted,
+            "shots": options.shots, "pack": options.pack, "same_figures": found == wanted,
+            **times,
         })  # fmt: skip
     return rows
 
 
 def spread_table(rows: list[dict[str, Any]]) -> str:
     """The table of several GPUs."""
+    rows = sorted(rows, key=lambda row: int(row["gpus"]))
     one = rows[0]
     lines = [
         f"{one['shots']} drops of a melon on {one['device']} with {one['cores']} cores, "
         f"{one['pack']} at a time on each GPU:",
         "",
-        "| GPUs | wall [s] | a shot [s] | times the first | figures of the first |",
-        "| --- | --- | --- | --- | --- |",
+        "| GPUs | wall [s] | a shot [s] | times the first | until all processes work [s] | "
+        "first shot of a process [s] | later ones [s] | after the last [s] | busy cores | "
+        "figures of the first |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     lines += [
         f"| {r['gpus']} | {r['wall']:.1f} | {r['wall'] / r['shots']:.2f} | "
-        f"{one['wall'] / r['wall']:.2f} | {'yes' if r['same_figures'] else 'no'} |"
+        f"{one['wall'] / r['wall']:.2f} | {r['until_all']:.1f} | {r['first_shot']:.1f} | "
+        f"{_seconds(r['later_shot'])} | {r['after_last']:.1f} | {_seconds(r['busy_cores'])} | "
+        f"{'yes' if r['same_figures'] else 'no'} |"
         for r in rows
     ]
     return "\n".join(lines)
 
 
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"
+
+
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Both sweeps."""
     device = choose_device(options.device)
-    walls, found = {}, {}
+    times, found = {}, {}
     first = prepare(options, device)
     for pack in (options.pack, 1):
-        walls[pack], found[pack] = swept(options, device, first, f"pack_{pack}", pack, pack)
+        times[pack], found[pack] = swept(options, device, first, f"pack_{pack}", pack, pack)
     alone = SweepFolder(options.out / "pack_1")
     peaks = [
         row["value"]["figures"]["peak_device_memory_bytes"]
@@ -150,25 +191,29 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     return {
         "device": name, "cores": os.cpu_count(), "shots": options.shots, "pack": options.pack,
         "points": found[1][0][2], "seconds_of_film": options.seconds,
-        "one_after_another": walls[1], "packed": walls[options.pack],
+        "one_after_another": times[1], "packed": times[options.pack],
         "peak_device_memory_bytes": max(peaks), "same_figures": found[1] == found[options.pack],
     }  # fmt: skip
 
 
 def markdown(row: dict[str, Any]) -> str:
     """The table."""
-    ratio = row["one_after_another"] / row["packed"]
+    alone, packed = row["one_after_another"], row["packed"]
     return "\n".join([
         f"{row['shots']} drops of a melon ({row['points']:,} points, {row['seconds_of_film']:g} s) "
         f"on {row['device']} with {row['cores']} cores:",
         "",
-        "| | wall [s] | a shot [s] |",
-        "| --- | --- | --- |",
-        f"| one after another | {row['one_after_another']:.1f} | "
-        f"{row['one_after_another'] / row['shots']:.1f} |",
-        f"| {row['pack']} at a time | {row['packed']:.1f} | {row['packed'] / row['shots']:.1f} |",
+        "| | wall [s] | a shot [s] | until all processes work [s] | first shot of a process [s] | "
+        "later ones [s] | after the last [s] | busy cores |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        *(
+            f"| {name} | {t['wall']:.1f} | {t['wall'] / row['shots']:.1f} | {t['until_all']:.1f} | "
+            f"{t['first_shot']:.1f} | {_seconds(t['later_shot'])} | {t['after_last']:.1f} | "
+            f"{_seconds(t['busy_cores'])} |"
+            for name, t in (("one after another", alone), (f"{row['pack']} at a time", packed))
+        ),
         "",
-        f"{ratio:.2f} times as fast; a shot's tensors take "
+        f"{alone['wall'] / packed['wall']:.2f} times as fast; a shot's tensors take "
         f"{row['peak_device_memory_bytes'] / 1e9:.2g} GB of the GPU; figures of both are "
         f"{'the same' if row['same_figures'] else 'not the same'}.",
     ])  # fmt: skip
