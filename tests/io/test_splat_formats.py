@@ -23,6 +23,7 @@ from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.io import kind_of, load_splats
+from gsfluent.io.splats.forge import DEGREES, save_forged
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
 
@@ -87,6 +88,29 @@ def test_our_own_splat_and_spz_come_back(tmp_path: Path, truth: Gaussians) -> No
         save_spz(turned, tmp_path / "a.spz", version=version)
         off = errors(load_splats(tmp_path / "a.spz"), truth)
         assert off["means"] < 1e-5 and off["shape"] < 0.25 and off["rest"] < 0.04
+
+
+@pytest.mark.parametrize(("kind", "bounds"), [
+    (".ksplat", {"means": 0, "shape": 1e-5, "opacity": 0.004, "color": 0.015, "rest": 1e-6}),
+    (".sog", {"means": 1e-3, "shape": 0.04, "opacity": 0.004, "color": 0.02, "rest": 0.01}),
+])  # fmt: skip
+def test_what_gaussforge_writes_for_us_comes_back(
+    kind: str, bounds: dict[str, float], tmp_path: Path, truth: Gaussians
+) -> None:
+    pytest.importorskip("gaussforge", reason="the extra formats is not installed")
+    save_forged(truth, tmp_path / f"a{kind}")
+    found = load_splats(tmp_path / f"a{kind}")
+    off = errors(found, truth)
+    assert {key: value for key, value in off.items() if value > bounds[key]} == {}
+    assert found.sh_degree == truth.sh_degree
+    wide = truth.with_sh_degree(3)
+    save_forged(wide, tmp_path / f"b{kind}")
+    assert load_splats(tmp_path / f"b{kind}").sh_degree == DEGREES[kind]
+
+
+def test_forged_files_have_names_of_their_own(tmp_path: Path, truth: Gaussians) -> None:
+    with pytest.raises(InputError, match="not a name of these"):
+        save_forged(truth, tmp_path / "a.ply")
 
 
 def trained(truth: Gaussians) -> torch.nn.ParameterDict:

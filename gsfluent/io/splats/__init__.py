@@ -6,6 +6,7 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     delta="DeltaFrame DeltaReader hamilton",
     delta_write="Roster steps write_delta",
+    forge="save_forged",
     load="READERS load_splats save_splats",
     ply="read_ply write_ply",
     splat="save_splat",
