@@ -27,15 +27,16 @@ from gsfluent.io import atomic_path, kind_of, load_capture, load_splats
 from gsfluent.pipeline.capture.orient import (
     DEFAULT_SIZE,
     camera_up,
-    make_frame,
     orient,
     upright_rotation,
 )
 from gsfluent.pipeline.simulate.stage import QUALITY
+from gsfluent.plan.proxy import proxy
 from gsfluent.run.front import front_side
 from gsfluent.run.photographs import is_photographs
+from gsfluent.scene.parts import Body
 from gsfluent.spatial.mesh_surface import surface_points
-from gsfluent.stages.breaking import SURE, breaks_from
+from gsfluent.stages.breaking import SURE, breaks_from, is_slender
 
 _log = logging.getLogger(__name__)
 
@@ -138,12 +139,13 @@ def made_shot(
     splats = _sampled(key, path)
     front, side = guess_front(key, path, splats)
     _log.info("front: %s; front: in the shot says better", side)
-    events, shown, fall = _fall(materials.get(material), _size(key, path, splats))
-    _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
     if front is not None:
         values["front"] = front
     values["objects"] = {"object": {"material": material}}
+    made_of = materials.get(material)
+    events, shown, fall = _fall(made_of, *_shape(key, values | SETTINGS, made_of))
+    _log.info("event: %s", fall)
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
     output = {**shown, **SETTINGS["output"]}
@@ -288,13 +290,15 @@ def _sampled(key: str, path: Path) -> Gaussians | None:
     return splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
 
 
-def _size(key: str, path: Path, splats: Gaussians | None) -> float:
-    """Largest extent that the object will have in the scene [m]."""
-    if splats is None:
-        return DEFAULT_SIZE
-    frame = make_frame(splats, None, Shot.from_dict({key: str(path.resolve())}))
-    placed = frame.apply(splats.means.double())
-    return float((placed.amax(dim=0) - placed.amin(dim=0)).max())
+def _shape(key: str, values: dict[str, Any], material: materials.Material) -> tuple[float, bool]:
+    """Largest extent that the object will have in the scene [m], and whether it is slender."""
+    if key == "capture":
+        return DEFAULT_SIZE, False
+    made = proxy(Shot.from_dict(values), [])  # kept: the plan of the run takes it again
+    (solid,) = made.solids.values()
+    body = Body("object", material, solid, made.frame)
+    low, high = body.bounds()
+    return float((high - low).max()), is_slender(body)
 
 
 def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[float] | None, str]:
@@ -358,10 +362,10 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
 
 
 def _fall(
-    material: materials.Material, size: float
+    material: materials.Material, size: float, slender: bool
 ) -> tuple[list[dict[str, Any]], dict[str, float], str]:
     """Events that break a material or show that it stays whole, time of the film, why in words."""
-    limit = breaks_from(material, size, size / QUALITY["preview"])
+    limit = breaks_from(material, size, size / QUALITY["preview"], slender=slender)
     if not SURE * limit <= _FASTEST:
         why = "does not break"
         if math.isfinite(limit):

@@ -4,9 +4,8 @@
 
 Each input is run as ``gsfluent run INPUT -o out/films/NAME`` runs it, into a smaller picture.
 Beside the folders lie NAME.png, frames at even distances in rows from left to right, and
-films.json: verdict, pieces, warnings, and the share of its outermost two rows and columns that
-matter covers in the first frame and in the fullest (what is cropped is there; dust and pieces that
-fly away are, too). A film that is there is not made again.
+films.json: verdict, pieces, warnings, and what leaves the picture: the largest share of all matter
+in any frame, and of a piece of more than 1 % of it. A film that is there is not made again.
 """
 
 from __future__ import annotations
@@ -22,11 +21,13 @@ import torch
 
 import gsfluent.run.from_input as from_input
 from gsfluent.cli import main as gsfluent
+from gsfluent.config import load_shot
 from gsfluent.io.atomic import write_json
+from gsfluent.pipeline.light.lamps import Lighting
+from gsfluent.pipeline.render.film import Film
 
 COLUMNS = 6
-_EDGE = 2  # px
-_DIFFERS = 24  # levels by which matter differs from the empty set
+_PIECE = 0.01  # of the matter: what is smaller is a crumb
 
 
 def made(source: Path, out: Path) -> dict[str, Any]:
@@ -57,13 +58,21 @@ def sheet(film: np.ndarray, count: int) -> np.ndarray:
     return page
 
 
-def at_edges(film: np.ndarray) -> list[float]:
-    """Share of the outermost pixels that differ from the median of the film, frame by frame."""
-    still = np.median(film, axis=0)
-    differs = (np.abs(film.astype(float) - still) > _DIFFERS).any(axis=-1)
-    inner = np.zeros(differs.shape[1:], bool)
-    inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
-    return [float(mask[~inner].mean()) for mask in differs]
+def outside(out: Path) -> tuple[float, float]:
+    """Largest share of the matter that is out of the picture, and of any piece above 1 % of it."""
+    film = Film(out, load_shot(out / "shot.yaml"), Lighting(), torch.device("cpu"))
+    most, piece = 0.0, 0.0
+    for index, camera in enumerate(film.cameras):
+        saved = film.frame(index)
+        places, depth = camera.project(saved.positions.double())
+        side = places.new_tensor([camera.width, camera.height])
+        gone = ((places < 0.0) | (places > side)).any(dim=1) | (depth <= 0.0)
+        most = max(most, float(gone.double().mean()))
+        for number in saved.fragments.unique().tolist():
+            mine = saved.fragments == number
+            if number >= 0 and float(mine.double().mean()) > _PIECE:
+                piece = max(piece, float(gone[mine].double().mean()))
+    return most, piece
 
 
 def judged(source: Path, folder: Path, frames: int) -> dict[str, Any]:
@@ -74,15 +83,15 @@ def judged(source: Path, folder: Path, frames: int) -> dict[str, Any]:
     record = made(source, folder / name)
     film = frames_of(folder / name / "video.mp4")
     Image.fromarray(sheet(film, frames)).save(folder / f"{name}.png")
-    edges = at_edges(film)
+    most, piece = outside(folder / name)
     found = record["simulation"] or {}
     return {
         "name": name,
         "verdict": record["verdict"],
         "frames": len(film),
         "pieces": (found.get("per_frame") or {}).get("pieces", [0])[-1],
-        "edge_first": edges[0],
-        "edge_most": max(edges),
+        "matter_outside": most,
+        "piece_outside": piece,
         "warnings": record["warnings"],
     }
 
