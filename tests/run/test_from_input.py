@@ -12,11 +12,13 @@ import torch
 import trimesh
 
 from gsfluent import materials
-from gsfluent.config import load_shot
+from gsfluent.config import Shot, load_shot
 from gsfluent.errors import InputError
 from gsfluent.io import save_image
+from gsfluent.pipeline.capture.front import front_side
+from gsfluent.pipeline.capture.orient import make_frame
+from gsfluent.pipeline.fill.mesh_skin import mesh_gaussians
 from gsfluent.run.from_input import _fall, find_input, guess_front, made_shot
-from gsfluent.run.front import front_side
 from gsfluent.stages.breaking import breaks_from
 
 
@@ -134,6 +136,18 @@ def test_the_painted_side_is_the_front(tmp_path: Path, caplog: pytest.LogCapture
         found = front_of(painted(tmp_path / "a.glb", tuple(side)))
     assert found is not None and np.dot(found, side) > math.cos(math.radians(20.0))
     assert "the side with the most to see" in caplog.text
+
+
+def test_a_written_shot_guesses_when_it_is_asked(tmp_path: Path) -> None:
+    side = np.array([math.cos(0.5), 0.0, -math.sin(0.5)])
+    source = painted(tmp_path / "a.glb", tuple(side))
+    skin = mesh_gaussians(source)
+    turns = {}
+    for word in ("auto", "guess"):
+        shot = Shot.from_dict({"mesh": str(source), "front": word})
+        turns[word] = make_frame(skin, None, shot).rotation @ torch.from_numpy(side)
+    # films begin at -y of the scene
+    assert float(turns["guess"][1]) < -math.cos(math.radians(20.0)) < float(turns["auto"][1])
 
 
 def test_what_looks_alike_from_all_sides_keeps_the_custom(tmp_path: Path) -> None:
