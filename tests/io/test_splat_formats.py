@@ -12,7 +12,9 @@ import gzip
 import io
 import json
 import os
+import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +108,20 @@ def test_what_gaussforge_writes_for_us_comes_back(
     wide = truth.with_sh_degree(3)
     save_forged(wide, tmp_path / f"b{kind}")
     assert load_splats(tmp_path / f"b{kind}").sh_degree == DEGREES[kind]
+
+
+def test_version_4_of_spz_is_read_by_gaussforge(
+    tmp_path: Path, truth: Gaussians, without: Callable[[str], None]
+) -> None:
+    pytest.importorskip("gaussforge", reason="the extra formats is not installed")
+    off = errors(load_splats(FOREIGN / "forty_v4.spz"), truth)
+    assert off["means"] < 2e-4 and off["shape"] < 0.08 and off["rest"] < 0.04
+    (tmp_path / "torn.spz").write_bytes((FOREIGN / "forty_v4.spz").read_bytes()[:600])
+    with pytest.raises(InputError, match=r"torn.spz: cannot be read"):
+        load_splats(tmp_path / "torn.spz")
+    without("gaussforge")
+    with pytest.raises(InputError, match=r"forty_v4.spz.*needs gaussforge"):
+        load_splats(FOREIGN / "forty_v4.spz")
 
 
 def test_forged_files_have_names_of_their_own(tmp_path: Path, truth: Gaussians) -> None:
@@ -206,9 +222,16 @@ def test_what_is_no_such_file(tmp_path: Path, name: str, data: bytes, said: str)
 
 
 def test_other_versions_say_what_reads_them(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"version 4.*zstd") as caught:
-        load_splats(FOREIGN / "forty_v4.spz")
+    later = bytearray((FOREIGN / "forty_v4.spz").read_bytes())
+    later[4] = 5
+    (tmp_path / "later.spz").write_bytes(later)
+    with pytest.raises(InputError, match="version 5") as caught:
+        load_splats(tmp_path / "later.spz")
     assert "splat-transform" in caught.value.hint
+    later[4:12] = struct.pack("<II", 4, 2**31)
+    (tmp_path / "huge.spz").write_bytes(later)
+    with pytest.raises(InputError, match="above the limit"):
+        load_splats(tmp_path / "huge.spz")
 
     def older(raw: bytes) -> bytes:
         return json.dumps(json.loads(raw) | {"version": 1}).encode()

@@ -1,17 +1,29 @@
-"""Splats written as ``.ksplat`` and ``.sog`` by the library gaussforge, from our own ``.ply``.
+"""Splats by the library gaussforge: ``.ksplat`` and ``.sog`` out, ``.spz`` of version 4 in.
 
-Needs gaussforge (``pip install "gsfluent[formats]"``); the two are read without it.
+Needs gaussforge (``pip install "gsfluent[formats]"``); it takes and gives ``.ply`` in memory.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError, need
 from gsfluent.io.atomic import atomic_path
-from gsfluent.io.splats.load import save_splats
+from gsfluent.io.splats.load import load_splats, save_splats
+
+_CONVERT = """
+import sys, gaussforge
+made = gaussforge.GaussForge().convert(sys.stdin.buffer.read(), sys.argv[1], "ply")
+if not made.get("data"):
+    sys.exit(str(made.get("error", "it is damaged")))
+with open(sys.argv[2], "wb") as file:
+    file.write(made["data"])
+"""
+# in a process of its own: it talks on stdout, and what a hostile file makes of it ends there
 
 DEGREES = {".ksplat": 2, ".sog": 3}
 """What is written, by the end of the name, and its highest SH degree."""
@@ -43,7 +55,31 @@ def save_forged(gaussians: Gaussians, path: str | Path) -> None:
         plain = Path(folder) / "splats.ply"
         save_splats(gaussians.with_sh_degree(degree).replace(labels=None), plain)
         made = GaussForge().convert(plain.read_bytes(), "ply", kind[1:])
-    if "error" in made:
-        raise InputError(f"{path}: gaussforge cannot write it ({made['error']})", "export a .ply")
+    if not made.get("data"):
+        said = made.get("error", "no reason given")
+        raise InputError(f"{path}: gaussforge cannot write it ({said})", "export a .ply")
     with atomic_path(path) as part:
         part.write_bytes(made["data"])
+
+
+def load_forged(packed: bytes, kind: str, path: str | Path) -> Gaussians:
+    """Splats of a file that gaussforge reads, in the axes that it gives them.
+
+    Args:
+        packed: The file.
+        kind: Its format, as gaussforge calls it.
+        path: Its name, for errors.
+
+    Raises:
+        InputError: No gaussforge, a damaged file, or values no splat can have.
+    """
+    need("gaussforge", "formats", f"{path}: this version")
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "splats.ply"
+        done = subprocess.run(
+            [sys.executable, "-c", _CONVERT, kind, str(plain)], input=packed, capture_output=True
+        )
+        if done.returncode != 0:
+            said = done.stderr.decode(errors="replace").strip().splitlines() or ["it crashed"]
+            raise InputError(f"{path}: cannot be read ({said[-1]})", "export the splat again")
+        return load_splats(plain)

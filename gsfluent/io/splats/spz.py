@@ -113,18 +113,19 @@ def _rest(sh: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def load_spz(path: str | Path) -> Gaussians:
-    """Read a ``.spz`` of version 2 or 3, as float32 on the CPU.
+    """Read a ``.spz`` of version 2 or 3, or of 4 with gaussforge, as float32 on the CPU.
 
     The axes are turned to those of a trained ``.ply`` (+y down, +z away from the viewer), so that
     a splat has the same axes in either file.
 
     Raises:
-        InputError: Missing, damaged, of another version, or above the limit of unpacked bytes.
+        InputError: Missing, damaged, of another version, above the limit of unpacked bytes, or
+            of version 4 without gaussforge.
     """
     packed = read_bytes(path)
-    if packed[:4] == _MAGIC.to_bytes(4, "little"):
-        raise InputError(f"{path}: is .spz version 4 or later, which packs by zstd", _AGAIN)
     most = unpacked_limit(len(packed))
+    if packed[:4] == _MAGIC.to_bytes(4, "little"):
+        return _upright(_load_later(path, packed, most))
     unpacker = zlib.decompressobj(wbits=31)
     try:
         data = unpacker.decompress(packed, most + 1)
@@ -158,15 +159,34 @@ def load_spz(path: str | Path) -> Gaussians:
     sh = np.zeros((count, rest + 1, 3))
     sh[:, 0] = (color / 255.0 - 0.5) / _COLOR_SCALE
     sh[:, 1:] = (harmonics.reshape(count, rest, 3) - 128.0) / 128.0
-    up = Gaussians(
-        means=float_tensor(means),
-        quats=float_tensor(quats[:, [3, 0, 1, 2]]),
-        scales=float_tensor(np.exp(scale / 16.0 - 10.0)),
-        opacities=float_tensor(opacity[:, 0] / 255.0),
-        sh=float_tensor(sh),
-    ).validated(str(path))
+    return _upright(
+        Gaussians(
+            means=float_tensor(means),
+            quats=float_tensor(quats[:, [3, 0, 1, 2]]),
+            scales=float_tensor(np.exp(scale / 16.0 - 10.0)),
+            opacities=float_tensor(opacity[:, 0] / 255.0),
+            sh=float_tensor(sh),
+        ).validated(str(path))
+    )
+
+
+def _upright(splats: Gaussians) -> Gaussians:
+    """The splats with their axes turned from +y up to those of a trained ``.ply``."""
     half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    return up.transformed(Frame(half_turn, torch.zeros(3), 1.0))
+    return splats.transformed(Frame(half_turn, torch.zeros(3), 1.0))
+
+
+def _load_later(path: str | Path, packed: bytes, most: int) -> Gaussians:
+    """A file of version 4, whose planes are packed by zstd each; gaussforge unpacks them."""
+    from gsfluent.io.splats.forge import load_forged
+
+    if len(packed) < _HEADER.size:
+        raise InputError(f"{path}: ends within its header", "export the splat again")
+    _, version, count, degree, *_ = _HEADER.unpack_from(packed)
+    if version != 4 or degree > 3:
+        raise InputError(f"{path}: cannot be read (version {version}, SH degree {degree})", _AGAIN)
+    within("unpacked_bytes", count * (20 + 3 * ((degree + 1) ** 2 - 1)), path, most)
+    return load_forged(packed, "spz", path)
 
 
 def _of_first_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
