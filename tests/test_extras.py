@@ -19,7 +19,7 @@ from gsfluent.demo import make_splats
 from gsfluent.errors import EXTRAS, MissingPackage
 from gsfluent.inspection.compare_weights import clip_scores
 from gsfluent.inspection.doctor import examine
-from gsfluent.io.splats.forge import save_forged
+from gsfluent.io.splats.load import save_forged
 from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh

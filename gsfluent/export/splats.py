@@ -18,8 +18,7 @@ from gsfluent.export.frames import NOBODY, FrameSequence, Moment
 from gsfluent.export.job import Job, span
 from gsfluent.io.axes import nearest_axes
 from gsfluent.io.gltf import save_glb
-from gsfluent.io.splats.forge import save_forged
-from gsfluent.io.splats.load import save_splats
+from gsfluent.io.splats.load import save_forged, save_splats
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
 from gsfluent.io.usd import open_usd

@@ -25,7 +25,7 @@ from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.io import kind_of, load_splats
-from gsfluent.io.splats.forge import DEGREES, save_forged
+from gsfluent.io.splats.load import FORGED, save_forged
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
 
@@ -107,7 +107,7 @@ def test_what_gaussforge_writes_for_us_comes_back(
     assert found.sh_degree == truth.sh_degree
     wide = truth.with_sh_degree(3)
     save_forged(wide, tmp_path / f"b{kind}")
-    assert load_splats(tmp_path / f"b{kind}").sh_degree == DEGREES[kind]
+    assert load_splats(tmp_path / f"b{kind}").sh_degree == FORGED[kind]
 
 
 def test_version_4_of_spz_is_read_by_gaussforge(
@@ -117,7 +117,7 @@ def test_version_4_of_spz_is_read_by_gaussforge(
     off = errors(load_splats(FOREIGN / "forty_v4.spz"), truth)
     assert off["means"] < 2e-4 and off["shape"] < 0.08 and off["rest"] < 0.04
     (tmp_path / "torn.spz").write_bytes((FOREIGN / "forty_v4.spz").read_bytes()[:600])
-    with pytest.raises(InputError, match=r"torn.spz: cannot be read"):
+    with pytest.raises(InputError, match=r"torn.spz: gaussforge cannot convert it \(it is damaged"):
         load_splats(tmp_path / "torn.spz")
     without("gaussforge")
     with pytest.raises(InputError, match=r"forty_v4.spz.*needs gaussforge"):

@@ -113,19 +113,16 @@ def _rest(sh: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def load_spz(path: str | Path) -> Gaussians:
-    """Read a ``.spz`` of version 2 or 3, or of 4 with gaussforge, as float32 on the CPU.
+    """Read a ``.spz`` of version 2 or 3, as float32 on the CPU.
 
     The axes are turned to those of a trained ``.ply`` (+y down, +z away from the viewer), so that
     a splat has the same axes in either file.
 
     Raises:
-        InputError: Missing, damaged, of another version, above the limit of unpacked bytes, or
-            of version 4 without gaussforge.
+        InputError: Missing, damaged, of another version, or above the limit of unpacked bytes.
     """
     packed = read_bytes(path)
     most = unpacked_limit(len(packed))
-    if packed[:4] == _MAGIC.to_bytes(4, "little"):
-        return _upright(_load_later(path, packed, most))
     unpacker = zlib.decompressobj(wbits=31)
     try:
         data = unpacker.decompress(packed, most + 1)
@@ -159,7 +156,7 @@ def load_spz(path: str | Path) -> Gaussians:
     sh = np.zeros((count, rest + 1, 3))
     sh[:, 0] = (color / 255.0 - 0.5) / _COLOR_SCALE
     sh[:, 1:] = (harmonics.reshape(count, rest, 3) - 128.0) / 128.0
-    return _upright(
+    return upright(
         Gaussians(
             means=float_tensor(means),
             quats=float_tensor(quats[:, [3, 0, 1, 2]]),
@@ -170,23 +167,29 @@ def load_spz(path: str | Path) -> Gaussians:
     )
 
 
-def _upright(splats: Gaussians) -> Gaussians:
+def upright(splats: Gaussians) -> Gaussians:
     """The splats with their axes turned from +y up to those of a trained ``.ply``."""
     half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     return splats.transformed(Frame(half_turn, torch.zeros(3), 1.0))
 
 
-def _load_later(path: str | Path, packed: bytes, most: int) -> Gaussians:
-    """A file of version 4, whose planes are packed by zstd each; gaussforge unpacks them."""
-    from gsfluent.io.splats.forge import load_forged
+def later_spz(path: str | Path) -> bytes | None:
+    """A file of version 4, whose planes are packed by zstd each; None for versions 2 and 3.
 
+    Raises:
+        InputError: Missing, of a still later version, or above the limit of unpacked bytes.
+    """
+    packed = read_bytes(path)
+    if packed[:4] != _MAGIC.to_bytes(4, "little"):
+        return None
     if len(packed) < _HEADER.size:
         raise InputError(f"{path}: ends within its header", "export the splat again")
     _, version, count, degree, *_ = _HEADER.unpack_from(packed)
     if version != 4 or degree > 3:
         raise InputError(f"{path}: cannot be read (version {version}, SH degree {degree})", _AGAIN)
-    within("unpacked_bytes", count * (20 + 3 * ((degree + 1) ** 2 - 1)), path, most)
-    return load_forged(packed, "spz", path)
+    needs = count * (20 + 3 * ((degree + 1) ** 2 - 1))
+    within("unpacked_bytes", needs, path, unpacked_limit(len(packed)))
+    return packed
 
 
 def _of_first_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
