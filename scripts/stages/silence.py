@@ -41,7 +41,7 @@ CASES = {
     "--resolution 256",
     "texture": "texture {out}/dog_solid.ply -o {out}/dog_inside.ply",
     "render": "render {out}/dog --size 1280x720 -o {out}/dog.mp4",
-    "export": "export {out}/dog -o {out}/dog_export",
+    "export": "export {out}/dog --to ply-seq,spz -o {out}/dog_export",
 }
 """Commands by name, in the order in which one needs what another leaves."""
 _WORDS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\r\n]+")
