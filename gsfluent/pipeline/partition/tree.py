@@ -40,7 +40,6 @@ PER_SPACING = 3.0
 """Voxels per point spacing and axis."""
 MOST = {"cpu": 4_000_000, "cuda": 64_000_000}
 """Voxels of a body's box, at most; more would make coarser ones."""
-_TOLD = 1.5  # times as coarse as wanted: of more a user is warned
 _RIM = 2  # point spacings around the body that have voxels
 _LAYERS = 64  # of voxels that have distances in double precision at once
 
@@ -79,8 +78,7 @@ class Partition:
         if count > most:
             coarser = (count / most) ** (1.0 / 3.0)
             self.voxel *= coarser
-            _log.log(
-                logging.WARNING if coarser > _TOLD else logging.INFO,
+            _log.info(
                 "partition: %.3g voxels are more than %.3g; they are %.2f times as coarse",
                 count, most, coarser,
             )  # fmt: skip
