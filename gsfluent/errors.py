@@ -17,6 +17,7 @@ EXTRAS = {
     "slurm": ("submitit",),
     "ray": ("ray",),
     "s3": ("s3fs",),
+    "formats": ("gaussforge",),
 }
 """Packages that gsfluent does without until they are asked for: extra -> names on the index."""
 

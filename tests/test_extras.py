@@ -15,9 +15,11 @@ import torch
 
 from gsfluent.choose.shot import _write
 from gsfluent.cli import main
+from gsfluent.demo import make_splats
 from gsfluent.errors import EXTRAS, MissingPackage
 from gsfluent.inspection.compare_weights import clip_scores
 from gsfluent.inspection.doctor import examine
+from gsfluent.io.splats.load import save_forged
 from gsfluent.io.usd import open_usd
 from gsfluent.pipeline.solid.field import SignedDistance
 from gsfluent.pipeline.solid.mesh import closed_mesh
@@ -55,6 +57,10 @@ def stage(tmp_path: Path) -> None:
         raise AssertionError("opened without usd-core")
 
 
+def packed(tmp_path: Path) -> None:
+    save_forged(make_splats("orange", spacing=0.02), tmp_path / "a.sog")
+
+
 def prompt(tmp_path: Path) -> None:
     clip_scores([np.zeros((8, 8, 3), np.uint8)], "a melon", tmp_path, CPU)
 
@@ -83,6 +89,7 @@ def ray_cluster(tmp_path: Path) -> None:
         (surface, "skimage", "mesh"),
         (page, "viser", "viewer"),
         (stage, "pxr", "usd"),
+        (packed, "gaussforge", "formats"),
         (cluster, "submitit", "slurm"),
         (ray_cluster, "ray", "ray"),
         (prompt, "transformers", "inpaint"),
@@ -164,7 +171,7 @@ def test_every_module_loads_without_the_extras() -> None:
 import importlib, pkgutil, sys
 sys.modules |= dict.fromkeys(
     ["pycolmap", "skimage", "viser", "pxr", "transformers", "accelerate", "matplotlib",
-     "submitit", "ray", "s3fs"])
+     "submitit", "ray", "s3fs", "gaussforge"])
 import gsfluent
 names = [m.name for m in pkgutil.walk_packages(gsfluent.__path__, "gsfluent.")]
 for name in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -59,6 +60,8 @@ class Verb:
         def says() -> str:
             return f"{name}: at work, {time.monotonic() - begun:.0f} s since the start"
 
+        if "torch" not in sys.modules:  # while it loads no other thread says anything
+            _log.info("%s: loading", name)
         with heartbeat("gsfluent", says, _LONGEST, first=_FIRST) as watched:
             vars(self)["_watched"] = watched  # no option of the command line
             return self._inside()

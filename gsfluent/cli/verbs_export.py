@@ -32,6 +32,7 @@ class Export(Verb):
 
     Formats (docs/guide/export.md says who reads what, and how large it gets):
       ply-seq  3DGS .ply per frame     spz, splat, glb  the same as smaller or newer files
+      ksplat, sog  the same for web viewers (extra formats)
       delta    all frames in one small file, read by gsfluent.io.DeltaReader
       usd      all frames in one file: splats, particles with velocity and damage
       vtk, points, vti                 the material points: .vtk, .ply, density volume

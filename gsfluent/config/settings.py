@@ -43,7 +43,8 @@ def _size(value: Any, place: Place) -> tuple[int, ...]:
 
 
 EXPORTS = (
-    "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk", "points", "vti", "meshes",
+    "ply-seq", "spz", "splat", "ksplat", "sog", "glb", "delta", "usd", "vtk", "points", "vti",
+    "meshes",
 )  # fmt: skip
 """What a run can write beside the video; ``gsfluent export`` writes these and more."""
 

@@ -58,6 +58,10 @@ def _axis(value: Any, place: Place) -> str | tuple[float, ...]:
     return tuple(sign * part + 0.0 for part in _AXES[axis])
 
 
+def _front(value: Any, place: Place) -> str | tuple[float, ...]:
+    return value if value == "guess" else _axis(value, place)
+
+
 @dataclasses.dataclass(frozen=True)
 class Shot:
     """One shot: what is read, what happens to it, what is written. Paths are absolute."""
@@ -90,9 +94,10 @@ class Shot:
         _axis, "Up axis of the input: auto, +x to -z, or [x, y, z].", "-y", default="auto"
     )
     front: str | Vector = key(
-        _axis,
+        _front,
         "Side of the input that faces the camera when the film begins: auto (the first photograph; "
-        "without one the custom of the axes), +x to -z, or [x, y, z].",
+        "without one the custom of the axes), guess (where most photographers stood; without them "
+        "the side with the most to see), +x to -z, or [x, y, z].",
         "+x",
         default="auto",
     )

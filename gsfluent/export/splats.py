@@ -13,12 +13,12 @@ from torch import Tensor
 
 from gsfluent import geometry
 from gsfluent.data import Gaussians
-from gsfluent.errors import InputError
+from gsfluent.errors import InputError, need
 from gsfluent.export.frames import NOBODY, FrameSequence, Moment
 from gsfluent.export.job import Job, span
 from gsfluent.io.axes import nearest_axes
 from gsfluent.io.gltf import save_glb
-from gsfluent.io.splats.load import save_splats
+from gsfluent.io.splats.load import save_forged, save_splats
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
 from gsfluent.io.usd import open_usd
@@ -81,6 +81,21 @@ def spz_sequence(job: Job) -> str:
 def splat_sequence(job: Job) -> str:
     """``splat/frame_0001.splat``."""
     return _sequence(job, "splat", "frame_{:04d}.splat", save_splat)
+
+
+def ksplat_sequence(job: Job) -> str:
+    """``ksplat/frame_0001.ksplat``."""
+    return _forged(job, "ksplat")
+
+
+def sog_sequence(job: Job) -> str:
+    """``sog/frame_0001.sog``."""
+    return _forged(job, "sog")
+
+
+def _forged(job: Job, kind: str) -> str:
+    need("gaussforge", "formats", f"--to {kind}")  # before the first frame is made
+    return _sequence(job, kind, f"frame_{{:04d}}.{kind}", save_forged)
 
 
 def glb_sequence(job: Job) -> str:

@@ -42,6 +42,12 @@ FORMATS: dict[str, Format] = {
     "splat": Format(
         ".splat per frame: the first web viewers", "splats.splat_sequence", splats_only=True
     ),
+    "ksplat": Format(
+        ".ksplat per frame: GaussianSplats3D (three.js)", "splats.ksplat_sequence", splats_only=True
+    ),
+    "sog": Format(
+        ".sog per frame: SuperSplat, PlayCanvas, small", "splats.sog_sequence", splats_only=True
+    ),
     "glb": Format(
         "glTF with KHR_gaussian_splatting per frame", "splats.glb_sequence", splats_only=True
     ),
@@ -66,7 +72,7 @@ _OTHERS: dict[tuple[str, ...], str] = {
     ("vdb", "nvdb", "openvdb"): "there is no library for it on PyPI; vti is the same volume",
     ("abc", "alembic", "fbx"): "use usd, or meshes and points",
     ("obj", "stl"): "use meshes, with --mesh-ending obj",
-    ("ksplat", "sog", "sogs"): "write ply-seq and convert it with splat-transform (npm)",
+    ("sogs",): "use sog, which is its successor in one file",
     ("gltf",): "use glb for splats, pieces-glb for meshes",
     ("pieces",): "use pieces-glb or pieces-usd",
     ("ply",): "use ply-seq for splats, points for material points, meshes for fragments",

@@ -24,18 +24,19 @@ from gsfluent.config.physgaussian.space import model_file
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.io import atomic_path, kind_of, load_capture, load_splats
+from gsfluent.pipeline.capture.front import photographers_side, splats_side
 from gsfluent.pipeline.capture.orient import (
     DEFAULT_SIZE,
     camera_up,
-    make_frame,
     orient,
     upright_rotation,
 )
 from gsfluent.pipeline.simulate.stage import QUALITY
-from gsfluent.run.front import front_side
+from gsfluent.plan.proxy import proxy
 from gsfluent.run.photographs import is_photographs
+from gsfluent.scene.scene import Body
 from gsfluent.spatial.mesh_surface import surface_points
-from gsfluent.stages.breaking import SURE, breaks_from
+from gsfluent.stages.breaking import SURE, breaks_from, is_slender
 
 _log = logging.getLogger(__name__)
 
@@ -50,12 +51,11 @@ _LOW, _HIGH = 0.5, 3.0  # heights of a drop [m]; what needs more is thrown down 
 _FASTEST = 25.0  # m/s at the floor, as a good arm throws: what needs more is shown whole
 _AFTER = 1.2  # seconds of film after the landing
 _QUICK = 0.06  # s: what lands with its length in less is shown slower, by as much
-_SLOWEST = 8  # times slower than it happens, at most
+_SLOWEST = 16  # times slower than it happens, at most
 _BEFORE = 0.8  # seconds of film before the landing of what is shown slower
 _SAMPLE = 2000  # points of a surface that are asked for their colour
-_VIEWED, _FEW = 20_000, 200  # points that are looked at for the front, and fewest that tell
+_VIEWED = 20_000  # points of a mesh that are looked at for the front
 _SOLID = 0.3  # opacity from which a splat counts
-_AROUND = 0.3  # mean of the directions to the photographers below which they stood all around
 
 _WORDS = {
     "fruit.watermelon": "watermelon melon",
@@ -138,12 +138,13 @@ def made_shot(
     splats = _sampled(key, path)
     front, side = guess_front(key, path, splats)
     _log.info("front: %s; front: in the shot says better", side)
-    events, shown, fall = _fall(materials.get(material), _size(key, path, splats))
-    _log.info("event: %s", fall)
     values: dict[str, Any] = {key: str(path.resolve())}
     if front is not None:
         values["front"] = front
     values["objects"] = {"object": {"material": material}}
+    made_of = materials.get(material)
+    events, shown, fall = _fall(made_of, *_shape(key, values | SETTINGS, made_of))
+    _log.info("event: %s", fall)
     if material in _INSIDE:
         values["texture"] = {"method": "procedural", "preset": _INSIDE[material]}
     output = {**shown, **SETTINGS["output"]}
@@ -273,7 +274,7 @@ def _nearest_to(preset: str, word: str) -> str:
 
 
 def _sampled(key: str, path: Path) -> Gaussians | None:
-    """Some splats on the surface of an input; None for photographs."""
+    """Splats on the surface of an input; None for photographs."""
     if key == "capture":
         return None
     if key == "mesh":
@@ -282,26 +283,25 @@ def _sampled(key: str, path: Path) -> Gaussians | None:
             torch.from_numpy(found.points).float(), torch.full((len(found.points),), 1e-3),
             torch.from_numpy(found.colors).float(),
         )  # fmt: skip
-    splats = load_splats(path)
-    solid = splats.opacities > _SOLID
-    splats = splats.select(solid) if int(solid.sum()) >= _FEW else splats
-    return splats.select(torch.arange(splats.count) % max(1, splats.count // _VIEWED) == 0)
+    return load_splats(path)
 
 
-def _size(key: str, path: Path, splats: Gaussians | None) -> float:
-    """Largest extent that the object will have in the scene [m]."""
-    if splats is None:
-        return DEFAULT_SIZE
-    frame = make_frame(splats, None, Shot.from_dict({key: str(path.resolve())}))
-    placed = frame.apply(splats.means.double())
-    return float((placed.amax(dim=0) - placed.amin(dim=0)).max())
+def _shape(key: str, values: dict[str, Any], material: materials.Material) -> tuple[float, bool]:
+    """Largest extent that the object will have in the scene [m], and whether it is slender."""
+    if key == "capture":
+        return DEFAULT_SIZE, False
+    made = proxy(Shot.from_dict(values), [])  # kept: the plan of the run takes it again
+    (solid,) = made.solids.values()
+    body = Body("object", material, solid, made.frame)
+    low, high = body.bounds()
+    return float((high - low).max()), is_slender(body)
 
 
 def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[float] | None, str]:
     """The direction towards who looks at the front of an input, and what it was guessed from.
 
     Photographers stand before the front: the middle of where they stood. Of a splat or a mesh, what
-    :func:`gsfluent.run.front.front_side` chooses.
+    :func:`gsfluent.pipeline.capture.front.front_side` chooses.
 
     Args:
         key: ``mesh``, ``splats`` or ``capture``.
@@ -318,23 +318,11 @@ def guess_front(key: str, path: Path, splats: Gaussians | None) -> tuple[list[fl
     if splats is None:
         capture = load_capture(path)
         up = orient(None, capture).up if len(capture.points) else camera_up(capture.cameras)
-        ahead = np.stack([camera.forward().double().numpy() for camera in capture.cameras])
-        ahead -= (ahead @ up)[:, None] * up
-        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
-        middle = -ahead.mean(axis=0)
-        if (length := float(np.linalg.norm(middle))) < _AROUND:
-            return None, "where the first photograph was taken, since they go all around"
-        return _rounded(middle / length), "the side from which most photographs were taken"
-    if splats.count < _FEW:
-        return None, "that by the custom of its axes, since there are too few points to judge"
-    up = orient(splats, up="auto", mesh=path if key == "mesh" else None).up
-    usual = -upright_rotation(up)[1]
-    points = splats.means.double().numpy()
-    colors = splats.colors().clamp(0.0, 1.0).double().numpy()
-    way, why = front_side(points, colors, up, usual)
-    if not why:
-        return None, "that by the custom of its axes, since no side shows clearly more"
-    return _rounded(way), why
+        way, why = photographers_side(capture.cameras, up)
+    else:
+        up = orient(splats, up="auto", mesh=path if key == "mesh" else None).up
+        way, why = splats_side(splats, up, -upright_rotation(up)[1])
+    return None if way is None else _rounded(way), why
 
 
 def _rounded(way: np.ndarray) -> list[float]:
@@ -358,10 +346,10 @@ def _by_color(color: np.ndarray) -> tuple[str, str]:
 
 
 def _fall(
-    material: materials.Material, size: float
+    material: materials.Material, size: float, slender: bool
 ) -> tuple[list[dict[str, Any]], dict[str, float], str]:
     """Events that break a material or show that it stays whole, time of the film, why in words."""
-    limit = breaks_from(material, size, size / QUALITY["preview"])
+    limit = breaks_from(material, size, size / QUALITY["preview"], slender=slender)
     if not SURE * limit <= _FASTEST:
         why = "does not break"
         if math.isfinite(limit):

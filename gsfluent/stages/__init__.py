@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    breaking="SURE breaking_rows breaks_from landing_speed",
+    breaking="SURE breaking_rows breaks_from is_slender landing_speed",
     chain="run_stages",
     check="check_shot",
     context="RunContext",

@@ -27,12 +27,13 @@ THIN_BODY = 8.0
 """Phase-field lengths of a body from which its toughness decides how it breaks."""
 
 
-def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
+def thin_walls(scene: Scene, dx: float, *, told: bool = False) -> dict[str, Any]:
     """Walls that a grid cannot carry, by body; a warning in the log for each body with some.
 
     Args:
         scene: The scene; only its solids have walls.
         dx: Grid spacing [m].
+        told: :func:`walls_note` has said it already; of a scene of one solid nothing is repeated.
 
     Returns:
         By name what :func:`gsfluent.pipeline.solid.walls.thin_shells` reports in scene metres, and
@@ -40,17 +41,18 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
         :data:`WALL_CELLS` cells, and ``note``, the warning; None where they have.
     """
     found = {}
-    for body in scene.bodies:
-        if body.solid is None:
-            continue
+    solids = [body for body in scene.bodies if body.solid is not None]
+    for body in solids:
         report = _walls(body, dx)
         if report["middle"] is not None:
             # measured from the corner of the grid, in metres
+            assert body.solid is not None
             origin = SignedDistance.of_solid(body.solid).origin
             local = torch.tensor(report["middle"]) - origin
             report["middle"] = body.frame.apply(origin + local / body.frame.scale).tolist()
         report["solve_cells"] = report["note"] = None
-        if report["warning"]:
+        smeared = any(material.law == "phase_field" for material in body.materials)
+        if report["warning"] and (smeared or len(solids) > 1 or not told):
             report["solve_cells"] = cells_for(scene, dx / report["cells_needed"])
             asked = setting(report["solve_cells"])
             report["hint"] = f"{asked}: {report['hint']}"
@@ -58,7 +60,7 @@ def thin_walls(scene: Scene, dx: float) -> dict[str, Any]:
                 f"{body.name}: {report['warning']}, too few to break as walls do; hint: {asked} "
                 f"gives them {WALL_CELLS:g} cells"
             )
-            if any(material.law == "phase_field" for material in body.materials):
+            if smeared:
                 report["note"] += (
                     "; cracks of law phase_field are wider than such walls, and what strikes "
                     "punches through: law: nacc cracks them"

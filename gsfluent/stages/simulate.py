@@ -170,7 +170,7 @@ def simulate_stage(context: RunContext) -> None:
             resume=resume,
         )
         # before the work: who must take a finer grid learns it while there is something to save
-        thin = thin_walls(scene, frames.run.matter.dx)
+        thin = thin_walls(scene, frames.run.matter.dx, told=bool(finer))
         weak = lowered(scene, frames.run.matter.dx)
         for note in weak:
             _log.warning("%s", note)

@@ -22,7 +22,8 @@ UPLOADS = (
 )  # fmt: skip
 """Endings of files that the page takes."""
 
-FORMATS = ("mp4", "gif", "webp", "png", "ply-seq", "spz", "splat", "glb", "delta", "usd", "vtk")
+FORMATS = ("mp4", "gif", "webp", "png", "ply-seq", "spz", "splat", "ksplat", "sog",
+           "glb", "delta", "usd", "vtk")  # fmt: skip
 _THROWN_FROM = 0.5  # metres
 _LARGEST = 1 << 30  # bytes of an uploaded file
 

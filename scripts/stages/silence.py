@@ -6,6 +6,7 @@
 Every command runs in a process of its own, once into a pipe, where progress is lines, and once on a
 pseudo-terminal of 100 columns, where it is bars. Whatever comes on stderr or stdout counts as said.
 The time until the first word, while Python loads, and after the last one count as silences.
+``--write`` keeps the rows of commands that were not run.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ CASES = {
     "--resolution 256",
     "texture": "texture {out}/dog_solid.ply -o {out}/dog_inside.ply",
     "render": "render {out}/dog --size 1280x720 -o {out}/dog.mp4",
-    "export": "export {out}/dog -o {out}/dog_export",
+    "export": "export {out}/dog --to ply-seq,spz -o {out}/dog_export",
 }
 """Commands by name, in the order in which one needs what another leaves."""
 _WORDS = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]|[\r\n]+")
@@ -95,18 +96,23 @@ def listen(command: list[str], terminal: bool) -> Heard:
     return Heard(time.monotonic() - begun, longest, before, worker.wait())
 
 
-def table(rows: dict[str, tuple[Heard, Heard]]) -> str:
-    """Longest silences of all commands as a Markdown table."""
-    lines = ["| command | s | longest silence, lines s | bars s | after |",
-             "| --- | --- | --- | --- | --- |"]  # fmt: skip
+def table(rows: dict[str, tuple[Heard, Heard]], page: str = "") -> str:
+    """Longest silences of all commands as a Markdown table, and the rows of others on a page."""
+    lines = {}
+    for name in CASES:
+        if found := re.search(rf"^\| {re.escape(name)} \|.*$", page, re.MULTILINE):
+            lines[name] = found.group()
     for name, (piped, drawn) in rows.items():
         worst = max(piped, drawn, key=lambda heard: heard.longest)
         words = re.sub(r"[|`]", " ", worst.before)[:60]
-        lines.append(
+        lines[name] = (
             f"| {name} | {piped.seconds:.0f} | {piped.longest:.1f} | {drawn.longest:.1f} | "
             f"{words} |"
         )
-    return "\n".join(lines)
+    order = sorted(lines, key=lambda name: [*CASES, name].index(name))
+    head = ["| command | s | longest silence, lines s | bars s | after |",
+            "| --- | --- | --- | --- | --- |"]  # fmt: skip
+    return "\n".join([*head, *(lines[name] for name in order)])
 
 
 def main() -> None:
@@ -140,7 +146,8 @@ def main() -> None:
         rows[name] = (heard[0], heard[1])
     print(table(rows))
     if args.write:
-        text = enter(PAGE.read_text(encoding="utf-8"), "silence", table(rows))
+        text = PAGE.read_text(encoding="utf-8")
+        text = enter(text, "silence", table(rows, text))
         with atomic_path(PAGE) as path:
             path.write_text(text, encoding="utf-8")
 

@@ -39,8 +39,9 @@ SHAPES = {
     "large ball": (0.3, 10.0),
     "small ball": (0.04, 10.0),
     "ball of 16 cells": (0.1, 16.0),
+    "ball of 18 cm": (0.18, 12.0),
 }
-"""Diameter [m] and cells across it. The estimate was fitted to the first two."""
+"""Diameter [m] and cells across it. The estimate was fitted to all but the last."""
 TRAVERSALS = 16.0
 """How long a fall is followed, in traversals of the body by the wave."""
 GOOD = 0.25

@@ -12,7 +12,9 @@ import gzip
 import io
 import json
 import os
+import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.io import kind_of, load_splats
+from gsfluent.io.splats.load import FORGED, save_forged
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
 
@@ -87,6 +90,43 @@ def test_our_own_splat_and_spz_come_back(tmp_path: Path, truth: Gaussians) -> No
         save_spz(turned, tmp_path / "a.spz", version=version)
         off = errors(load_splats(tmp_path / "a.spz"), truth)
         assert off["means"] < 1e-5 and off["shape"] < 0.25 and off["rest"] < 0.04
+
+
+@pytest.mark.parametrize(("kind", "bounds"), [
+    (".ksplat", {"means": 0, "shape": 1e-5, "opacity": 0.004, "color": 0.015, "rest": 1e-6}),
+    (".sog", {"means": 1e-3, "shape": 0.04, "opacity": 0.004, "color": 0.02, "rest": 0.01}),
+])  # fmt: skip
+def test_what_gaussforge_writes_for_us_comes_back(
+    kind: str, bounds: dict[str, float], tmp_path: Path, truth: Gaussians
+) -> None:
+    pytest.importorskip("gaussforge", reason="the extra formats is not installed")
+    save_forged(truth, tmp_path / f"a{kind}")
+    found = load_splats(tmp_path / f"a{kind}")
+    off = errors(found, truth)
+    assert {key: value for key, value in off.items() if value > bounds[key]} == {}
+    assert found.sh_degree == truth.sh_degree
+    wide = truth.with_sh_degree(3)
+    save_forged(wide, tmp_path / f"b{kind}")
+    assert load_splats(tmp_path / f"b{kind}").sh_degree == FORGED[kind]
+
+
+def test_version_4_of_spz_is_read_by_gaussforge(
+    tmp_path: Path, truth: Gaussians, without: Callable[[str], None]
+) -> None:
+    pytest.importorskip("gaussforge", reason="the extra formats is not installed")
+    off = errors(load_splats(FOREIGN / "forty_v4.spz"), truth)
+    assert off["means"] < 2e-4 and off["shape"] < 0.08 and off["rest"] < 0.04
+    (tmp_path / "torn.spz").write_bytes((FOREIGN / "forty_v4.spz").read_bytes()[:600])
+    with pytest.raises(InputError, match=r"torn.spz: gaussforge cannot convert it \(it is damaged"):
+        load_splats(tmp_path / "torn.spz")
+    without("gaussforge")
+    with pytest.raises(InputError, match=r"forty_v4.spz.*needs gaussforge"):
+        load_splats(FOREIGN / "forty_v4.spz")
+
+
+def test_forged_files_have_names_of_their_own(tmp_path: Path, truth: Gaussians) -> None:
+    with pytest.raises(InputError, match="not a name of these"):
+        save_forged(truth, tmp_path / "a.ply")
 
 
 def trained(truth: Gaussians) -> torch.nn.ParameterDict:
@@ -182,9 +222,16 @@ def test_what_is_no_such_file(tmp_path: Path, name: str, data: bytes, said: str)
 
 
 def test_other_versions_say_what_reads_them(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"version 4.*zstd") as caught:
-        load_splats(FOREIGN / "forty_v4.spz")
+    later = bytearray((FOREIGN / "forty_v4.spz").read_bytes())
+    later[4] = 5
+    (tmp_path / "later.spz").write_bytes(later)
+    with pytest.raises(InputError, match="version 5") as caught:
+        load_splats(tmp_path / "later.spz")
     assert "splat-transform" in caught.value.hint
+    later[4:12] = struct.pack("<II", 4, 2**31)
+    (tmp_path / "huge.spz").write_bytes(later)
+    with pytest.raises(InputError, match="above the limit"):
+        load_splats(tmp_path / "huge.spz")
 
     def older(raw: bytes) -> bytes:
         return json.dumps(json.loads(raw) | {"version": 1}).encode()

@@ -24,3 +24,13 @@ def test_the_worse_of_both_is_named() -> None:
     piped, drawn = silence.Heard(9.0, 1.0, "soon", 0), silence.Heard(9.0, 2.0, "late", 0)
     line = silence.table({"plan": (piped, drawn)}).splitlines()[-1]
     assert line == "| plan | 9 | 1.0 | 2.0 | late |"
+
+
+def test_rows_of_what_was_not_run_stay_and_all_stand_in_order() -> None:
+    silence = load_script("stages/silence")
+    heard = silence.Heard(3.0, 1.0, "soon", 0)
+    page = "| plan | 9 | 1.0 | 2.0 | late |\n| render | 8 | 1.0 | 2.0 | later |\n"
+    rows = silence.table({"fill": (heard, heard), "plan": (heard, heard)}, page).splitlines()[2:]
+    assert [row.split(" | ")[:2] for row in rows] == [
+        ["| plan", "3"], ["| fill", "3"], ["| render", "8"],
+    ]  # fmt: skip

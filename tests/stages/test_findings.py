@@ -160,6 +160,8 @@ def test_thin_walls_are_told_with_the_cells_that_would_do(caplog: pytest.LogCapt
     fine = grid_spacing(scene, cells)
     assert WALL_CELLS <= report["thinnest"] / fine < WALL_CELLS * cells / (cells - 1)
     caplog.clear()
+    again = thin_walls(scene, coarse, told=True)["plate"]
+    assert again["warning"] == report["warning"] and again["note"] is None and caplog.text == ""
     enough = thin_walls(scene, grid_spacing(scene, 2 * cells))["plate"]
     assert enough["warning"] is enough["solve_cells"] is None and caplog.text == ""
     assert cells_for(scene, fine) == cells

@@ -6,7 +6,7 @@ __getattr__, __dir__, __all__ = room(
     __name__,
     delta="DeltaFrame DeltaReader hamilton",
     delta_write="Roster steps write_delta",
-    load="READERS load_splats save_splats",
+    load="READERS load_splats save_forged save_splats",
     ply="read_ply write_ply",
     splat="save_splat",
     spz="save_spz",

@@ -8,6 +8,7 @@ implementation's ``save_ply``.
 from __future__ import annotations
 
 import logging
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from gsfluent import geometry
 from gsfluent.data.gaussians import Gaussians
 from gsfluent.errors import InputError
+from gsfluent.io.atomic import atomic_path
 from gsfluent.io.splats.checkpoint import load_checkpoint
 from gsfluent.io.splats.compressed import (
     decode_compressed,
@@ -25,11 +27,12 @@ from gsfluent.io.splats.compressed import (
     float_tensor,
     is_compressed,
 )
+from gsfluent.io.splats.forge import converted
 from gsfluent.io.splats.ksplat import load_ksplat
 from gsfluent.io.splats.ply import read_ply, write_ply
 from gsfluent.io.splats.sog import load_sog
 from gsfluent.io.splats.splat import load_splat
-from gsfluent.io.splats.spz import load_spz
+from gsfluent.io.splats.spz import later_spz, load_spz, upright
 
 logger = logging.getLogger(__name__)
 
@@ -41,8 +44,20 @@ _REQUIRED = (
     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
 )  # fmt: skip
 
+
+def _load_spz(path: Path) -> Gaussians:
+    """A ``.spz`` of any version; 4 by gaussforge."""
+    packed = later_spz(path)
+    if packed is None:
+        return load_spz(path)
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "splats.ply"
+        plain.write_bytes(converted(packed, "spz", "ply", path))
+        return upright(load_splats(plain))
+
+
 READERS = {
-    ".splat": load_splat, ".spz": load_spz, ".ksplat": load_ksplat, ".sog": load_sog,
+    ".splat": load_splat, ".spz": _load_spz, ".ksplat": load_ksplat, ".sog": load_sog,
     ".pt": load_checkpoint, ".ckpt": load_checkpoint,
 }  # fmt: skip
 """Readers by the end of the name; all others are read as ``.ply``."""
@@ -103,6 +118,37 @@ def load_splats(path: str | Path) -> Gaussians:
         normals=_normals(vertex),
     )
     return gaussians.validated(str(path))
+
+
+FORGED = {".ksplat": 2, ".sog": 3}
+"""What gaussforge writes for us, by the end of the name, and its highest SH degree."""
+
+
+def save_forged(gaussians: Gaussians, path: str | Path) -> None:
+    """Write splats as ``.ksplat`` or ``.sog``, atomically; normals and labels are left out.
+
+    A ``.ksplat`` has level 0: numbers as they are, colours and opacities in 8 bits. A ``.sog``
+    has code books for scales and colours, found by clustering.
+
+    Args:
+        gaussians: What to write, in any axes; SH above :data:`FORGED` is left out.
+        path: Output file.
+
+    Raises:
+        InputError: Another ending, no gaussforge, or values no splat can have.
+        RunError: The disk is full.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in FORGED:
+        raise InputError(f"{path}: not a name of these", f"end it with {' or '.join(FORGED)}")
+    degree = min(gaussians.sh_degree, FORGED[kind])
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "splats.ply"
+        save_splats(gaussians.with_sh_degree(degree).replace(labels=None), plain)
+        made = converted(plain.read_bytes(), "ply", kind[1:], path)
+    with atomic_path(path) as part:
+        part.write_bytes(made)
 
 
 def save_splats(

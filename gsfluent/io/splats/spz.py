@@ -122,8 +122,6 @@ def load_spz(path: str | Path) -> Gaussians:
         InputError: Missing, damaged, of another version, or above the limit of unpacked bytes.
     """
     packed = read_bytes(path)
-    if packed[:4] == _MAGIC.to_bytes(4, "little"):
-        raise InputError(f"{path}: is .spz version 4 or later, which packs by zstd", _AGAIN)
     most = unpacked_limit(len(packed))
     unpacker = zlib.decompressobj(wbits=31)
     try:
@@ -158,15 +156,40 @@ def load_spz(path: str | Path) -> Gaussians:
     sh = np.zeros((count, rest + 1, 3))
     sh[:, 0] = (color / 255.0 - 0.5) / _COLOR_SCALE
     sh[:, 1:] = (harmonics.reshape(count, rest, 3) - 128.0) / 128.0
-    up = Gaussians(
-        means=float_tensor(means),
-        quats=float_tensor(quats[:, [3, 0, 1, 2]]),
-        scales=float_tensor(np.exp(scale / 16.0 - 10.0)),
-        opacities=float_tensor(opacity[:, 0] / 255.0),
-        sh=float_tensor(sh),
-    ).validated(str(path))
+    return upright(
+        Gaussians(
+            means=float_tensor(means),
+            quats=float_tensor(quats[:, [3, 0, 1, 2]]),
+            scales=float_tensor(np.exp(scale / 16.0 - 10.0)),
+            opacities=float_tensor(opacity[:, 0] / 255.0),
+            sh=float_tensor(sh),
+        ).validated(str(path))
+    )
+
+
+def upright(splats: Gaussians) -> Gaussians:
+    """The splats with their axes turned from +y up to those of a trained ``.ply``."""
     half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-    return up.transformed(Frame(half_turn, torch.zeros(3), 1.0))
+    return splats.transformed(Frame(half_turn, torch.zeros(3), 1.0))
+
+
+def later_spz(path: str | Path) -> bytes | None:
+    """A file of version 4, whose planes are packed by zstd each; None for versions 2 and 3.
+
+    Raises:
+        InputError: Missing, of a still later version, or above the limit of unpacked bytes.
+    """
+    packed = read_bytes(path)
+    if packed[:4] != _MAGIC.to_bytes(4, "little"):
+        return None
+    if len(packed) < _HEADER.size:
+        raise InputError(f"{path}: ends within its header", "export the splat again")
+    _, version, count, degree, *_ = _HEADER.unpack_from(packed)
+    if version != 4 or degree > 3:
+        raise InputError(f"{path}: cannot be read (version {version}, SH degree {degree})", _AGAIN)
+    needs = count * (20 + 3 * ((degree + 1) ** 2 - 1))
+    within("unpacked_bytes", needs, path, unpacked_limit(len(packed)))
+    return packed
 
 
 def _of_first_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:

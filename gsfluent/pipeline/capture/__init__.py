@@ -5,6 +5,7 @@ from gsfluent._lazy import room
 __getattr__, __dir__, __all__ = room(
     __name__,
     carve="carve_cavities",
+    front="photographers_side splats_side",
     hull=(
         "Ground Hull centre_hull contradiction focus_point hull_grid hull_points "
         "inside_masks lattice masked_views visual_hull"

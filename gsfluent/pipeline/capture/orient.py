@@ -15,6 +15,7 @@ from gsfluent import geometry
 from gsfluent.config import Shot
 from gsfluent.data import Camera, Capture, Frame, Gaussians
 from gsfluent.errors import InputError
+from gsfluent.pipeline.capture.front import photographers_side, splats_side
 from gsfluent.spatial.mesh_file import in_metres, up_axes
 from gsfluent.spatial.shape import cluster, robust_box
 from gsfluent.spatial.standing import upright
@@ -146,11 +147,15 @@ def make_frame(
     gaussians.validated("make_frame")
     mesh, up = (None, "auto") if shot is None else (shot.mesh, shot.up)
     stance = orient(gaussians, capture, up, mesh)
-    rotation = upright_rotation(
-        stance.up,
-        None if capture is None else capture.cameras,
-        None if shot is None or isinstance(shot.front, str) else shot.front,
-    )
+    cameras = None if capture is None else capture.cameras
+    front: Any = None if shot is None or isinstance(shot.front, str) else shot.front
+    if shot is not None and shot.front == "guess":
+        if cameras:
+            front, _ = photographers_side(cameras, stance.up)
+        else:
+            usual = -upright_rotation(stance.up)[1]
+            front, _ = splats_side(gaussians.to("cpu"), stance.up, usual)
+    rotation = upright_rotation(stance.up, cameras, front)
     points = _object_points(gaussians, None)
     points = points[~cluster(points).floaters]
     if stance.floor_from == "support plane":

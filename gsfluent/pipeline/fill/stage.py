@@ -176,7 +176,8 @@ class Fill(Stage):
         matter, hollow = self._matter(field, device)
         occupied, depth, _, box = matter
         if float(depth.max()) < 1.5 * box.voxel:
-            logger.warning("fill: nothing but thin parts at this resolution")
+            # of walls too thin to break the simulation tells, in its own cells
+            logger.info("fill: nothing but thin parts at this resolution")
         report_progress(progress, 3, total, "interior Gaussians")
         merged, inner, placed = populate(
             gaussians.labelled(SURFACE),

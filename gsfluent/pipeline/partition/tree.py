@@ -78,7 +78,7 @@ class Partition:
         if count > most:
             coarser = (count / most) ** (1.0 / 3.0)
             self.voxel *= coarser
-            _log.warning(
+            _log.info(
                 "partition: %.3g voxels are more than %.3g; they are %.2f times as coarse",
                 count, most, coarser,
             )  # fmt: skip

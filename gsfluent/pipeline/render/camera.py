@@ -28,11 +28,12 @@ _SWEEP = 70.0
 _SMOOTH_FRAMES = 5.0
 _AHEAD = 6  # frames that the camera steps back before the matter does
 _HELD = 30  # frames that it stays back before it comes nearer again
-_SHARE = 0.95  # of the matter that is in the picture
+_SHARE, _SPRAY = 0.98, 0.995  # of the matter that is in the picture, and where it need not go far
 _ROOM = 1.15  # free space around the matter, as a factor on the distance
 _LEAST = 1.2  # distance, as a factor on that at which the object at first fits
 FARTHEST = 4.5
-"""The same at most."""
+"""The same at most, for the share; a spray beyond it shrinks the subject by :data:`_SPRAYED`."""
+_SPRAYED = 2.0
 _LAG = 0.6  # share of the free space that a fall may run ahead of the camera
 _WHOLE = 1.12  # free space around the whole object, however tall, as a factor on the distance
 
@@ -45,14 +46,16 @@ class Action:
         center: Robust centre of the matter per frame [m], shape [F, 3].
         radius: Distance from the centre that holds nine tenths of it, per frame [m], shape [F].
         reach: Distance from the first centre that holds all of the objects [m].
-        extent: Horizontal distance from the centre, and height above or below it, that hold 95 %
+        extent: Horizontal distance from the centre, and height above or below it, that hold 98 %
             of it each, per frame [m], shape [F, 2]; ``radius`` twice when absent.
+        spray: The same for 99.5 % of it; ``extent`` when absent.
     """
 
     center: Tensor
     radius: Tensor
     reach: float = 0.0
     extent: Tensor | None = None
+    spray: Tensor | None = None
 
     @classmethod
     def of(cls, positions: Sequence[Tensor], objects: Tensor | None = None) -> Action:
@@ -63,21 +66,24 @@ class Action:
             objects: Which of the first frame's is of the objects, not of bullets or liquids, bool
                 [N]; all of it when absent.
         """
-        # the middle of what lies between the outer tenths: a median follows the largest heap only
-        centers, radius, extent = [], [], []
+        # the middle of what the picture shall hold: a median follows the largest heap, and a hand
+        # that rolls away on one side leaves the picture
+        centers, radius, extent, spray = [], [], [], []
         for matter in positions:
             points = _thin(matter.double().cpu())
-            center = quantiles(points, (0.1, 0.9)).mean(dim=0)
+            center = quantiles(points, (1.0 - _SHARE, _SHARE)).mean(dim=0)
             away = points - center
             centers.append(center)
             radius.append(quantiles(away.norm(dim=-1), (0.9,))[0])
             apart = torch.stack([away[:, :2].norm(dim=-1), away[:, 2].abs()], dim=-1)
-            extent.append(quantiles(apart, (_SHARE,))[0])
+            held, most = quantiles(apart, (_SHARE, _SPRAY))
+            extent.append(held)
+            spray.append(most)
         center = torch.stack(centers)
         first = positions[0].double().cpu()
         first = first if objects is None else first[objects.cpu()]
         reach = float((first - center[0]).norm(dim=-1).amax()) if len(first) else 0.0
-        return cls(center, torch.stack(radius), reach, torch.stack(extent))
+        return cls(center, torch.stack(radius), reach, torch.stack(extent), torch.stack(spray))
 
 
 def _thin(values: Tensor) -> Tensor:
@@ -107,9 +113,9 @@ def _vertical_fov(size: tuple[int, int]) -> float:
 def orbit(action: Action, size: tuple[int, int], *, sweep: float = _SWEEP) -> list[Camera]:
     """One camera per frame: circles slowly, follows the matter softly, steps back for a burst.
 
-    It passes the front in the middle of the film. The distance shows 95 % of the matter, but the
-    whole object at least, however tall, and from 4.5 times as far at most: a spray of debris must
-    not shrink the subject to a dot.
+    It passes the front in the middle of the film. The distance shows 98 % of the matter, but the
+    whole object at least, however tall, and from 4.5 times as far at most: debris must not shrink
+    the subject to a dot. It shows 99.5 % where twice as far is enough.
 
     Args:
         action: Where the matter is.
@@ -148,9 +154,13 @@ def _fits(wide: Tensor, tall: Tensor, size: tuple[int, int]) -> Tensor:
 def _distance(action: Action, size: tuple[int, int]) -> Tensor:
     """Of the camera per frame [m], shape [F]: it steps back ahead of the burst."""
     extent = action.radius[:, None].expand(-1, 2) if action.extent is None else action.extent
-    fits = _fits(extent[:, 0], extent[:, 1], size)
+    spray = extent if action.spray is None else action.spray
+    fits, all_of_it = (_fits(each[:, 0], each[:, 1], size) for each in (extent, spray))
     whole = action.reach / math.sin(math.radians(_FIELD_OF_VIEW) / 2.0)
-    wanted = fits.clamp(min=_LEAST * float(fits[0]), max=FARTHEST * float(fits[0]))
+    wanted = torch.maximum(
+        fits.clamp(min=_LEAST * float(fits[0]), max=FARTHEST * float(fits[0])),
+        all_of_it.clamp(max=_SPRAYED * float(fits[0])),
+    )
     # the widest of the frames around: it steps back ahead of a burst, and stays back for a while
     early, late = wanted[:1].expand(_HELD), wanted[-1:].expand(_AHEAD)
     windows = torch.cat([early, wanted, late]).unfold(0, _HELD + _AHEAD + 1, 1)

@@ -310,6 +310,24 @@ def test_the_camera_steps_back_for_a_burst_and_comes_nearer_again() -> None:
     assert float(far[-1].center().norm()) < 4.0 * float(far[0].center().norm())
 
 
+def test_what_rolls_away_on_one_side_stays_in_the_picture() -> None:
+    """A hand of 4 % of the matter; where it is 0.2 %, it is let go and the subject stays large."""
+    body = ball().means
+    ends = {}
+    for share in (0.04, 0.002):
+        hand = body[torch.arange(max(2, int(share * len(body))))]
+        rolled = hand.new_tensor([0.012, 0.0, 0.0])
+        film = [torch.cat([body, hand + i * rolled]) for i in range(60)]
+        cameras = orbit(Action.of(film), (96, 72), sweep=0.0)
+        places, _ = cameras[-1].project(film[-1][len(body) :].double())
+        whole, _ = cameras[-1].project(body.double())
+        assert float(whole.min()) > 0.0 and bool((whole < whole.new_tensor([96.0, 72.0])).all())
+        height = float(whole[:, 1].max() - whole[:, 1].min())
+        ends[share] = (float((places[:, 0] / 96.0 - 0.5).abs().max()), height)
+    assert ends[0.04][0] < 0.5 < ends[0.002][0]
+    assert ends[0.002][1] > 1.3 * ends[0.04][1]
+
+
 def test_camera_path_is_interpolated(tmp_path: Path) -> None:
     path = tmp_path / "path.json"
     keys = [{"eye": [x, -1.0, 0.5], "target": [0.0, 0.0, 0.0]} for x in (0.0, 1.0)]

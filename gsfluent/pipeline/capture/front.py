@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from gsfluent.data import Camera, Gaussians
+
 Array = NDArray[np.float64]
+
+_VIEWED, _FEW = 20_000, 200  # splats that are looked at, and fewest that tell
+_SOLID = 0.3  # opacity from which a splat counts
+_AROUND = 0.3  # mean of the directions to the photographers below which they stood all around
 
 _SIDES = 24
 _PIXELS = 40  # of a picture along the longest side: features, not the grain of single splats
@@ -18,6 +27,51 @@ _COLOR = 0.3  # what a step of colour counts, in diagonals of the thing
 _FAR = 0.2  # of the diagonal: a mirrored point that misses by more than this just misses
 _SAMPLE, _NEAR, _EVERY = 4000, 24, 4  # points compared, those that share a colour, and a stride
 _SHIFTS = np.linspace(-0.06, 0.06, 5)  # of the mirror from the middle, in diagonals
+
+
+def photographers_side(cameras: Sequence[Camera], up: Array) -> tuple[Array | None, str]:
+    """The middle of where photographers stood.
+
+    Args:
+        cameras: Theirs.
+        up: Upward direction, unit vector [3].
+
+    Returns:
+        Unit vector [3] from the thing to them, or None where they stood all around; and words.
+    """
+    ahead = np.stack([camera.forward().double().numpy() for camera in cameras])
+    ahead -= (ahead @ up)[:, None] * up
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True).clip(1e-9)
+    middle = -ahead.mean(axis=0)
+    if (length := float(np.linalg.norm(middle))) < _AROUND:
+        return None, "where the first photograph was taken, since they go all around"
+    return middle / length, "the side from which most photographs were taken"
+
+
+def splats_side(splats: Gaussians, up: Array, usual: Array) -> tuple[Array | None, str]:
+    """The side of splats on a surface that :func:`front_side` chooses.
+
+    Args:
+        splats: Some or all of them; up to 20 000 of the solid ones are looked at.
+        up: Upward direction, unit vector [3].
+        usual: As of :func:`front_side`.
+
+    Returns:
+        Unit vector [3] from the thing to who looks, or None where the usual side will do; and
+        words.
+    """
+    solid = splats.opacities > _SOLID
+    if int(solid.sum()) >= _FEW:
+        splats = splats.select(solid)
+    splats = splats.select(torch.arange(0, splats.count, max(1, splats.count // _VIEWED)))
+    if splats.count < _FEW:
+        return None, "that by the custom of its axes, since there are too few points to judge"
+    points = splats.means.double().numpy()
+    colors = splats.colors().clamp(0.0, 1.0).double().numpy()
+    way, why = front_side(points, colors, up, usual)
+    if not why:
+        return None, "that by the custom of its axes, since no side shows clearly more"
+    return way, why
 
 
 def front_side(points: Array, colors: Array, up: Array, usual: Array) -> tuple[Array, str]:
