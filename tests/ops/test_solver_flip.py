@@ -120,9 +120,9 @@ def test_shorter_steps_break_as_much() -> None:
         assert result.passed, f"{result.quantity}: {result.value}"
 
 
-@pytest.mark.parametrize(("cfl", "flip"), [(0.5, 0.0), (0.8, 0.0), (0.25, 0.5), (0.125, 0.75)])
+@pytest.mark.parametrize(("cfl", "flip"), [(0.5, 0.0), (0.8, 0.0), (0.25, 0.4142), (0.125, 0.6818)])
 def test_a_shot_keeps_what_its_courant_number_says(cfl: float, flip: float) -> None:
-    assert SolverOptions(cfl=cfl).flip == pytest.approx(flip)
+    assert SolverOptions(cfl=cfl).flip == pytest.approx(flip, abs=1e-4)
 
 
 def _solver(**options: Any) -> ops.Solver:

@@ -229,8 +229,8 @@ struct SolverView {
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes
   const int32_t* object;
-  // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the share of their
-  // own motion that points keep in a step (leave_share); or null and 0
+  // [N, 9] m C of each point with a part of the stress that `slope` holds (own_slope) [kg/s], and
+  // the share of their own motion that points keep in a step (leave_share); or null and 0
   T* own;
   T flip;
   // of scenes with one of these three, on CUDA: node velocities of the pass without forces; volume

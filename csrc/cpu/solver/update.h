@@ -270,6 +270,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         own[i] += row[kMassColumn] * spin.m[i];
         slope[i] += own[i];
         own[i] += row[kMassColumn] * c.m[i];
+        own[i] += P(T(kOwnStress)) * (slope[i] - own[i]);
       }
       for (int i = 0; i < 3; ++i) velocity[i] += value[i];
       packet.store3(velocity, s.velocity, done);

@@ -20,6 +20,8 @@ from gsfluent import ops
 from gsfluent.ops.damage import DamageField
 from gsfluent.ops.plasticity import INSTANT, weakened
 from gsfluent.ops.reference import spring
+from gsfluent.ops.reference.tensors import to_matrix
+from gsfluent.ops.solver import OWN_STRESS
 
 REACH = 3.0
 """Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
@@ -247,7 +249,7 @@ class Stepper:
         if push is not None:
             grid_velocity, given = push.rub(grid_velocity, grid[..., 3])
             impulse = impulse + given
-        own = self._own(place, take, blocks, body)
+        own = self._own(place, take, blocks, body, dt)
         deformation = None if self.deformation is None else take(self.deformation)
         x, v, c, f, skipped = ops.g2p(
             grid_velocity, place, dx=scene.dx, dt=dt, blocks=blocks, body=body,
@@ -277,13 +279,15 @@ class Stepper:
 
     def _own(
         self, place: Tensor, take: Callable[[Tensor], Tensor], blocks: ops.Blocks,
-        body: Tensor | None,
+        body: Tensor | None, dt: float,
     ) -> tuple[Tensor, Tensor] | None:  # fmt: skip
         """Velocity and affine matrix that points keep of what the transfer alone would take."""
         scene = self.scene
         if scene.flip == 0.0:
             return None
-        velocity, affine = take(self.velocity), take(self.affine)
+        pushed = (OWN_STRESS * dt * 4.0 / scene.dx**2) * scene.volume / scene.mass
+        affine = self.affine - pushed[:, None, None] * to_matrix(self.stress)
+        velocity, affine = take(self.velocity), take(affine)
         free, _ = ops.p2g(
             place, velocity, affine, take(scene.mass), dx=scene.dx, blocks=blocks, body=body,
             fields=scene.fields,
