@@ -44,8 +44,6 @@ def impact(dtype: torch.dtype = torch.float64, radius: float = 2.5, **options: A
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", MATTER)
 def test_solver_does_what_the_composed_operators_do(name: str, device: str) -> None:
-    if device == "cuda" and name == "metal with a rate":
-        pytest.skip("a law of the CPU")
     worlds = []
     for place, engine in ((device, "solver"), ("cpu", "ops")):
         with running_on(place, engine):  # type: ignore[arg-type]

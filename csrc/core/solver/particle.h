@@ -196,6 +196,20 @@ GSF_HOST_DEVICE T own_slope(T c, T slope) {
   return c + T(kOwnStress) * (slope - c);
 }
 
+// Nodes do not feel an even stress, so points hold as their own motion what it gave them in the
+// steps before: as much as in kept_time s. It is no motion, and what is read is without it.
+template <typename T>
+GSF_HOST_DEVICE T held_time(double kept_time) {
+  return T(kOwnStress * kept_time);
+}
+// Time for which the stress goes into the slope at the end of a step: of the coming one, or less
+// what is held where none comes.
+template <typename T>
+GSF_HOST_DEVICE T stress_time(const SolverView<T>& s, T dt_next) {
+  if (dt_next > T(0)) return dt_next;
+  return T(0) - held_time<T>(double(s.flip) * (s.clock->kept_time + s.clock->dt));
+}
+
 // What the transfer took of a particle's own motion is given back: `velocity` and `own` hold that
 // share of it, and get what the particle has in the end, which is stored.
 template <typename T>
@@ -423,7 +437,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     if (waves) wave2 = law_wave_squared<T, kLaws>(law, material, out.strain);
   }
   T slope[9];
-  store_slope(slope, c, stress, r, dt_next);
+  store_slope(slope, c, stress, r, kKeeps ? stress_time(s, dt_next) : dt_next);
   const T* velocity = value;
   if constexpr (kKeeps) {
     keep_own(s, p, c, r[kMassColumn], value, dt, before.velocity, before.own, slope);
@@ -500,11 +514,13 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;
   T slope[9];
-  store_slope(slope, c, state.stress, r, dt);
+  const T held = s.own != nullptr ? held_time<T>(s.clock->kept_time) : T(0);
+  store_slope(slope, c, state.stress, r, dt + held);
   store_motion(s, p, v, slope);
   T bound = momentum_bound(v, slope, mass, s.dx);
   if (s.own != nullptr) {
-    for (int i = 0; i < 9; ++i) slope[i] = own_slope(mass * c.m[i], slope[i]);
+    const T part = (T(kOwnStress) * dt + held) / (dt + held);
+    for (int i = 0; i < 9; ++i) slope[i] = mass * c.m[i] + part * (slope[i] - mass * c.m[i]);
     store_nine(s, s.own, p, slope);
     bound = larger(momentum_bound(v, slope, mass, s.dx), bound);
   }

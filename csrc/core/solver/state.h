@@ -146,8 +146,9 @@ struct SolverClock {
   uint64_t moved;        // 49 bits: furthest a collider moved in this step
   double dt_most;        // 50 longest automatic step [s]
   int64_t shared_homes;  // 51 homes whose window touches shared blocks (CUDA)
+  double kept_time;      // 52 of a stress that stays, what points hold as their own motion [s]
 };
-constexpr int kClockWords = 52;
+constexpr int kClockWords = 53;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
