@@ -5,6 +5,7 @@ Units as in :mod:`gsfluent.lab.problems.contact.contact`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -46,7 +47,7 @@ def cubes(cells: int, *, touch: bool = True, speed: float = 0.05) -> tuple[float
 
 
 def pressed(cells: int, share: float, *, touch: bool = True) -> float:
-    """Press a cube slowly between two plates; its height beyond that between them [dx].
+    """Press a cube slowly between two plates; how far each has sunk into it [dx].
 
     Args:
         cells: Edge of the cube [dx].
@@ -54,8 +55,10 @@ def pressed(cells: int, share: float, *, touch: bool = True) -> float:
         touch: Whether plates push points; else they hold nodes.
     """
     way, speed = share * cells, 0.02
-    rows = [wall(2, 0.37, mode="separate"), wall(2, 0.37 + cells, -1, mode="separate")]
-    rows[1] = wall(2, 0.37 + cells, -1, mode="separate", velocity=[0.0, 0.0, -speed])
+    rows = [
+        wall(2, 0.37, mode="separate"),
+        wall(2, 0.37 + cells, -1, mode="separate", velocity=[0.0, 0.0, -speed]),
+    ]
     world = bodies(
         [box((0.13, 0.27, 0.37), (cells,) * 3, SPACING)], [torch.zeros(3, dtype=torch.float64)],
         dtype=torch.float32, colliders=rows, surface=HALF if touch else None,
@@ -64,6 +67,38 @@ def pressed(cells: int, share: float, *, touch: bool = True) -> float:
     layer = (2 * cells) ** 2
     world.run(way / speed)
     z = world.position[:, 2].double()
-    height = float(z[order[-layer:]].mean() - z[order[:layer]].mean())
+    between = float(z[order[-layer:]].mean() - z[order[:layer]].mean())
     # the outer layers lie half a spacing inside, less what they are pressed themselves
-    return height + (1.0 - share) * SPACING - (cells - way)
+    return 0.5 * (between + (1.0 - share) * SPACING - (cells - way))
+
+
+@problem(tier="fast")
+def unequal_cubes() -> Iterator[Result]:
+    """Cubes of 3, 5, 7 cells meet others twice as large: energy left."""
+    edges = (3, 5, 7)
+    left, most = zip(*(cubes(n) for n in edges), strict=True)
+    lost = ", ".join(f"{1.0 - e:.3f}" for e in left)
+    yield compare(
+        "energy after / before, 7 cells", left[-1], 1.0, tolerance=0.1, source="elastic impact",
+        note=f"0.05 c each; points push; lost at 3, 5, 7 cells: {lost}; at nodes, 7 cells: "
+        f"{1.0 - cubes(7, touch=False)[0]:.3f}",
+    )  # fmt: skip
+    order = math.log((1.0 - left[0]) / (1.0 - left[-1])) / math.log(edges[-1] / edges[0])
+    yield compare(
+        "order of the energy lost, 3 to 7 cells", order, 1.0, error=max(0.0, 1.0 - order),
+        tolerance=0.2, source="order 1",
+    )  # fmt: skip
+    yield compare(
+        "largest energy / first", max(most), 1.0, tolerance=1e-5, source="energy never rises"
+    )
+
+
+@problem(tier="fast")
+def pressed_cube() -> Iterator[Result]:
+    """Two plates press a cube: how far they sink into it."""
+    for cells, share in ((4, 0.05), (8, 0.05), (8, 0.24)):
+        yield compare(
+            f"each plate in a cube of {cells} cells, pressed by {share:.0%}",
+            pressed(cells, share), tolerance=0.1, unit="dx", source="touching",
+            note=f"plates hold nodes: {pressed(cells, share, touch=False):.3f} dx",
+        )  # fmt: skip
