@@ -40,10 +40,6 @@ from gsfluent.ops.viscous import check_viscous
 ELASTIC, NACC, PHASE = LAWS["elastic"], LAWS["nacc"], LAWS["phase_field"]
 CFL_MOST = 0.5
 """Largest Courant number at which colliders may push points: from 0.6 on energy was made."""
-CFL_WHOLE = 0.5
-"""Courant number of steps that take of points' own motion all that the transfer takes."""
-OWN_STRESS = 0.5
-"""Part of stress that counts as own motion: ``kOwnStress`` of ``csrc/core/solver/particle.h``."""
 RADIUS_MOST = 0.5
 """Largest contact radius [dx]: ``kSpringReach`` of ``csrc/core/collider/spring.h``."""
 _MANY = 500_000
@@ -68,22 +64,6 @@ _REASONS = {
         "take fewer points per cell, or lower dx",
     ),
 }
-
-
-def own_share(cfl: float) -> float:
-    """Share of their own motion with which points lose as much in a time as by steps of 0.5.
-
-    Of a motion that one step of Courant number 0.5 halves, steps of ``cfl`` lose half in the same
-    time: ``1 - s = 2 (1 - 2^(-2 cfl))``. Of slower losses they take up to 1.4 times as much, of
-    faster ones less (docs/theory/mpm.md).
-
-    Args:
-        cfl: Courant number.
-
-    Returns:
-        Share in [0, 1); 0 from 0.5 on.
-    """
-    return max(0.0, 2.0 ** (1.0 - cfl / CFL_WHOLE) - 1.0)
 
 
 def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
@@ -164,7 +144,7 @@ class Solver(SolverState):
         irreversible: Whether broken points lose their cohesion for good.
         flip: Share of their own velocity and affine matrix, less what the nodes would give back by
             themselves, that points keep in a step (FLIP; the rest is APIC), in [0, 1). With
-            :func:`own_share` shorter steps lose as much in the same time as those of ``cfl`` 0.5
+            ``1 - 2 cfl`` shorter steps lose as much in the same time as those of ``cfl`` 0.5
             (docs/theory/mpm.md). 0 costs nothing. Not beside law ``phase_field``.
         frame: Velocity of the grid [m/s], which changes no law of motion but what the grid loses.
             With colliders 0. Default: without them that of the matter, each body by its mass, so
@@ -375,7 +355,7 @@ class Solver(SolverState):
         if not 0.0 <= share < 1.0:
             raise InputError(
                 f"Solver: flip must lie in [0, 1), got {share}",
-                hint="own_share(cfl) keeps what is lost in a time; 0 is APIC",
+                hint="1 - 2 cfl keeps what is lost in a time; 0 is APIC",
             )
         if share > 0.0 and self._law_set == DAMAGE_FIELD:
             raise InputError(

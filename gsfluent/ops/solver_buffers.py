@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-CLOCK_WORDS = 53
+CLOCK_WORDS = 52
 BLOCK_NODES = 64
 NEIGHBOURS = 27
 SITE_FIELDS = 16
@@ -25,7 +25,7 @@ MAX_HOME = 2**26
 FLOATS = (
     "time", "until", "dt", "dt_next", "dt_fixed", "dt_scale", "cfl", "gradient_limit",
     "momentum_unit", "mass_unit", "dt_min", "dt_max", "speed_seen", "wave_seen", "slack", "travel",
-    "dt_most", "kept_time",
+    "dt_most",
 )  # fmt: skip
 """Members of the clock that are doubles; the others are integers."""
 CLOCK = (
@@ -36,7 +36,7 @@ CLOCK = (
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
     "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
-    "travel", "moved", "dt_most", "shared_homes", "kept_time",
+    "travel", "moved", "dt_most", "shared_homes",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}

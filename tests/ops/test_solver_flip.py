@@ -12,9 +12,7 @@ from gsfluent.errors import InputError
 from gsfluent.lab.problems.contact import placement
 from gsfluent.lab.problems.contact.contact import SPACING, YOUNG, bodies
 from gsfluent.lab.world.driver import World, running_on
-from gsfluent.lab.world.shapes import ball, box, parameters
-from gsfluent.lab.world.walls import wall
-from gsfluent.ops.solver import own_share
+from gsfluent.lab.world.shapes import ball, parameters
 from gsfluent.pipeline.simulate.engine import SolverOptions
 
 BRITTLE = parameters(YOUNG, 0.2, 1.0, c2=1.85, c3=0.3, c4=10.0, c5=0.05)
@@ -115,42 +113,14 @@ def test_calls_divide_a_run_without_a_trace(device: str) -> None:
     assert torch.allclose(whole.affine, parts.affine, rtol=0.0, atol=bar)
 
 
-@pytest.mark.parametrize("engine", ["solver", "ops"])
-def test_an_even_stress_is_not_read_as_motion(engine: str) -> None:
-    """A pressed block that walls hold on all sides: inside nothing moves, whatever points hold."""
-    cells = 8
-    walls = [wall(axis, at, side) for axis in range(3) for at, side in ((0.0, 1), (cells, -1))]
-    points = box([0.0, 0.0, 0.0], [cells] * 3, SPACING)
-    pressed = torch.tensor([-0.02, -0.02, -0.02, 0.0, 0.0, 0.0], dtype=torch.float64)
-    with running_on("cpu", engine):  # type: ignore[arg-type]
-        world = World(
-            points, [0.0, 0.0, 0.0], volume=SPACING**3, dx=1.0, law=0, colliders=walls,
-            params=parameters(YOUNG, 0.2, 1.0), strain=pressed.expand(len(points), 6), flip=0.6,
-            dt=0.2,
-        )  # fmt: skip
-    inside = ((points - 0.5 * cells).abs() < 1.0).all(dim=1)
-    for _ in range(2):
-        world.run(steps=2)
-        # held is 0.005 to 0.009; what the walls do to it comes nearer by two cells a step
-        assert float(world.affine[inside].abs().max()) < 1e-5
-        assert float(world.velocity[inside].abs().max()) < 1e-5
-    assert world.elastic() > 0.0
-
-
-@pytest.mark.parametrize("cfl", [0.4, 0.25, 0.1])
-def test_what_a_whole_step_halves_shorter_ones_halve_in_its_time(cfl: float) -> None:
-    left = 1.0 - 0.5 * (1.0 - own_share(cfl))
-    assert left ** (0.5 / cfl) == pytest.approx(0.5)
-
-
 def test_shorter_steps_break_as_much() -> None:
     for result in placement.brittle_steps():
         assert result.passed, f"{result.quantity}: {result.value}"
 
 
-@pytest.mark.parametrize(("cfl", "flip"), [(0.5, 0.0), (0.8, 0.0), (0.25, 0.4142), (0.125, 0.6818)])
+@pytest.mark.parametrize(("cfl", "flip"), [(0.5, 0.0), (0.8, 0.0), (0.25, 0.5), (0.125, 0.75)])
 def test_a_shot_keeps_what_its_courant_number_says(cfl: float, flip: float) -> None:
-    assert SolverOptions(cfl=cfl).flip == pytest.approx(flip, abs=1e-4)
+    assert SolverOptions(cfl=cfl).flip == pytest.approx(flip)
 
 
 def _solver(**options: Any) -> ops.Solver:

@@ -110,10 +110,8 @@ GSF_HOST_DEVICE void start_clock(SolverClock& c, double dx) {
   reset_largest(c, dx);
 }
 
-// End of a step: time moves on by dt; dt_next, chosen one step ago, becomes current. Points keep the
-// share `flip` of their own motion.
-GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count, double flip) {
-  c.kept_time = flip * (c.kept_time + c.dt);
+// End of a step: time moves on by dt; dt_next, chosen one step ago, becomes current.
+GSF_HOST_DEVICE void end_step(SolverClock& c, double dx, int64_t count) {
   c.step += 1;
   c.particle_steps += count;
   c.dt_min = c.dt_min > 0.0 ? min(c.dt_min, c.dt) : c.dt;

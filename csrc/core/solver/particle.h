@@ -185,31 +185,6 @@ GSF_HOST_DEVICE Mat3<T> spin_beside(const T* value, const T* given, T dt, T inv_
   return spin;
 }
 
-// Of the slope that stress gives a particle in a step, the part that counts as its own motion. What
-// a force adds would pass the filter once without its share, and shorter steps lose more for it;
-// all of it would let points store what the nodes never feel (docs/theory/mpm.md).
-constexpr double kOwnStress = 0.5;
-
-// `own` of a particle whose slope is `slope` with the stress of the coming step, `c` without.
-template <typename T>
-GSF_HOST_DEVICE T own_slope(T c, T slope) {
-  return c + T(kOwnStress) * (slope - c);
-}
-
-// Nodes do not feel an even stress, so points hold as their own motion what it gave them in the
-// steps before: as much as in kept_time s. It is no motion, and what is read is without it.
-template <typename T>
-GSF_HOST_DEVICE T held_time(double kept_time) {
-  return T(kOwnStress * kept_time);
-}
-// Time for which the stress goes into the slope at the end of a step: of the coming one, or less
-// what is held where none comes.
-template <typename T>
-GSF_HOST_DEVICE T stress_time(const SolverView<T>& s, T dt_next) {
-  if (dt_next > T(0)) return dt_next;
-  return T(0) - held_time<T>(double(s.flip) * (s.clock->kept_time + s.clock->dt));
-}
-
 // What the transfer took of a particle's own motion is given back: `velocity` and `own` hold that
 // share of it, and get what the particle has in the end, which is stored.
 template <typename T>
@@ -219,7 +194,7 @@ GSF_HOST_DEVICE void keep_own(const SolverView<T>& s, int64_t p, const Mat3<T>& 
   for (int i = 0; i < 9; ++i) {
     const T given = own[i] + mass * spin.m[i];
     slope[i] += given;
-    own[i] = own_slope(mass * c.m[i] + given, slope[i]);
+    own[i] = mass * c.m[i] + given;
   }
   for (int i = 0; i < 3; ++i) velocity[i] += value[i];
   store_nine(s, s.own, p, own);
@@ -437,7 +412,7 @@ GSF_HOST_DEVICE StepFlags finish_particle(const SolverView<T>& s, int64_t p,
     if (waves) wave2 = law_wave_squared<T, kLaws>(law, material, out.strain);
   }
   T slope[9];
-  store_slope(slope, c, stress, r, kKeeps ? stress_time(s, dt_next) : dt_next);
+  store_slope(slope, c, stress, r, dt_next);
   const T* velocity = value;
   if constexpr (kKeeps) {
     keep_own(s, p, c, r[kMassColumn], value, dt, before.velocity, before.own, slope);
@@ -486,6 +461,11 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   Mat3<T> c;
   T v[3];
   load_motion(s, p, v, c.m);
+  T bound = T(0);
+  if (!measure && s.own != nullptr) {  // m C, still without stress
+    store_nine(s, s.own, p, c.m);
+    bound = momentum_bound(v, c.m, mass, s.dx);
+  }
   const T inverse = mass > T(0) ? T(1) / mass : T(0);
   for (int i = 0; i < 9; ++i) c.m[i] *= inverse;
   if (measure) {
@@ -514,16 +494,9 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
     state.stress =
         unloading_share(material.exponent, r[kPaceColumn], state.stress, c) * state.stress;
   T slope[9];
-  const T held = s.own != nullptr ? held_time<T>(s.clock->kept_time) : T(0);
-  store_slope(slope, c, state.stress, r, dt + held);
+  store_slope(slope, c, state.stress, r, dt);
   store_motion(s, p, v, slope);
-  T bound = momentum_bound(v, slope, mass, s.dx);
-  if (s.own != nullptr) {
-    const T part = (T(kOwnStress) * dt + held) / (dt + held);
-    for (int i = 0; i < 9; ++i) slope[i] = mass * c.m[i] + part * (slope[i] - mass * c.m[i]);
-    store_nine(s, s.own, p, slope);
-    bound = larger(momentum_bound(v, slope, mass, s.dx), bound);
-  }
+  bound = larger(momentum_bound(v, slope, mass, s.dx), bound);
   largest.bound = larger(float(bound), largest.bound);
 }
 

@@ -146,9 +146,8 @@ struct SolverClock {
   uint64_t moved;        // 49 bits: furthest a collider moved in this step
   double dt_most;        // 50 longest automatic step [s]
   int64_t shared_homes;  // 51 homes whose window touches shared blocks (CUDA)
-  double kept_time;      // 52 of a stress that stays, what points hold as their own motion [s]
 };
-constexpr int kClockWords = 53;
+constexpr int kClockWords = 52;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
@@ -230,8 +229,8 @@ struct SolverView {
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes
   const int32_t* object;
-  // [N, 9] m C of each point with a part of the stress that `slope` holds (own_slope) [kg/s], and
-  // the share of their own motion that points keep in a step (leave_share); or null and 0
+  // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the share of their
+  // own motion that points keep in a step (leave_share); or null and 0
   T* own;
   T flip;
   // of scenes with one of these three, on CUDA: node velocities of the pass without forces; volume

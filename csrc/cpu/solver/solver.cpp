@@ -137,7 +137,7 @@ class Lockstep {
     c.lost += all.lost;
     if (all.leaves) c.leaving += 1;
     give_largest(all.largest, c);
-    end_step(c, double(s_.dx), s_.count, double(s_.flip));
+    end_step(c, double(s_.dx), s_.count);
   }
 
  private:

@@ -235,7 +235,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   if (kLaws != kElasticOnly && mask_bits(loss > P(0)) != 0)
     stress = unloading_share(loss, row[kPaceColumn], stress, c) * stress;
   P slope[9];
-  const P scale = P(kKeeps ? stress_time(s, dt_next) : dt_next) * row[kStressColumn];
+  const P scale = P(dt_next) * row[kStressColumn];
   const Mat3<P> tau = to_mat3(stress);
   for (int i = 0; i < 9; ++i) slope[i] = row[kMassColumn] * c.m[i] - scale * tau.m[i];
 
@@ -270,7 +270,6 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         own[i] += row[kMassColumn] * spin.m[i];
         slope[i] += own[i];
         own[i] += row[kMassColumn] * c.m[i];
-        own[i] += P(T(kOwnStress)) * (slope[i] - own[i]);
       }
       for (int i = 0; i < 3; ++i) velocity[i] += value[i];
       packet.store3(velocity, s.velocity, done);

@@ -61,7 +61,7 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   SolverClock clock = *s.clock;
   clock.travel += float_of_bits(clock.moved);
   clock.moved = 0;
-  end_step(clock, double(s.dx), s.total, double(s.flip));
+  end_step(clock, double(s.dx), s.total);
   choose_unit(clock);
   *s.clock = clock;
 }

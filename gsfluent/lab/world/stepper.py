@@ -20,8 +20,6 @@ from gsfluent import ops
 from gsfluent.ops.damage import DamageField
 from gsfluent.ops.plasticity import INSTANT, weakened
 from gsfluent.ops.reference import spring
-from gsfluent.ops.reference.tensors import to_matrix
-from gsfluent.ops.solver import OWN_STRESS
 
 REACH = 3.0
 """Width of the layer that is repeated behind a periodic face [dx]: a point reads nodes up to 1.5
@@ -186,7 +184,6 @@ class Stepper:
         rows = 0 if scene.colliders is None else scene.colliders.shape[0]
         self.impulse = torch.zeros(rows, 3, dtype=torch.float64, device=position.device)
         self.time, self.steps = 0.0, 0
-        self.held = 0.0  # time for which the stress is in affine matrices unseen [s]
         self.info = torch.zeros(4, dtype=torch.int64, device=position.device)
         self._blocks: ops.Blocks | None = None
         self._travelled = 0.0
@@ -236,9 +233,8 @@ class Stepper:
             self.peak = self.cracks.step(
                 self.alpha, self.peak, place, scene.volume, dx=scene.dx, blocks=blocks, body=body
             )
-        affine = self.affine - self._pushed_by(self.held) if scene.flip > 0.0 else self.affine
         grid, moments = ops.p2g(
-            place, take(self.velocity), take(affine), take(scene.mass),
+            place, take(self.velocity), take(self.affine), take(scene.mass),
             dx=scene.dx, blocks=blocks, dt=dt, stress=take(self.stress),
             volume=take(scene.volume), body=body, fields=scene.fields, contact=contact,
         )  # fmt: skip
@@ -252,7 +248,7 @@ class Stepper:
         if push is not None:
             grid_velocity, given = push.rub(grid_velocity, grid[..., 3])
             impulse = impulse + given
-        own = self._own(place, take, blocks, body, affine, dt)
+        own = self._own(place, take, blocks, body)
         deformation = None if self.deformation is None else take(self.deformation)
         x, v, c, f, skipped = ops.g2p(
             grid_velocity, place, dx=scene.dx, dt=dt, blocks=blocks, body=body,
@@ -275,31 +271,21 @@ class Stepper:
         *returned, info = self._map(increment, dt)
         after = self._thickened((returned[0], returned[1], returned[2]), increment, dt)
         self.viscous, self.strain, self.alpha, self.stress = after
-        if own is not None:  # what an even stress leaves there is no motion
-            self.held = scene.flip * (self.held + OWN_STRESS * dt)
-            self.affine = self.affine + self._pushed_by(self.held)
         self.info += info
         self.peak = self.cracks.grown(self.peak, self.alpha)
         self.impulse += impulse
         self.time += dt
         self.steps += 1
 
-    def _pushed_by(self, seconds: float) -> Tensor:
-        """What the stress takes from affine matrices in a time, [N, 3, 3]."""
-        scene = self.scene
-        scale = (4.0 * seconds / scene.dx**2) * scene.volume / scene.mass
-        return scale[:, None, None] * to_matrix(self.stress)
-
     def _own(
         self, place: Tensor, take: Callable[[Tensor], Tensor], blocks: ops.Blocks,
-        body: Tensor | None, affine: Tensor, dt: float,
+        body: Tensor | None,
     ) -> tuple[Tensor, Tensor] | None:  # fmt: skip
         """Velocity and affine matrix that points keep of what the transfer alone would take."""
         scene = self.scene
         if scene.flip == 0.0:
             return None
-        affine = affine - OWN_STRESS * self._pushed_by(dt)
-        velocity, affine = take(self.velocity), take(affine)
+        velocity, affine = take(self.velocity), take(self.affine)
         free, _ = ops.p2g(
             place, velocity, affine, take(scene.mass), dx=scene.dx, blocks=blocks, body=body,
             fields=scene.fields,

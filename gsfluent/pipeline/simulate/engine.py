@@ -10,9 +10,9 @@ from typing import NamedTuple, Protocol
 from torch import Tensor
 
 from gsfluent.errors import InputError
-from gsfluent.ops.solver import CFL_MOST, CFL_WHOLE, own_share
+from gsfluent.ops.solver import CFL_MOST
 
-CFL = CFL_WHOLE
+CFL = 0.5
 
 
 class Unhealthy(Exception):
@@ -134,7 +134,7 @@ class SolverOptions:
     @property
     def flip(self) -> float:
         """Share of their own motion that points keep where the solver can (docs/theory/mpm.md)."""
-        return own_share(self.cfl)
+        return max(0.0, 1.0 - self.cfl / CFL)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cfl <= 1.0:

@@ -82,17 +82,10 @@ def grid_mask(state: State, matter: Matter) -> Tensor:
     return mask
 
 
-def count_calm(
-    state: State, on_grid: Tensor, gravity: Tensor, dx: float, flip: float = 0.0
-) -> State:
-    """Count the frames during which points hardly moved.
-
-    Points that keep a share ``flip`` of their own motion hold stress as rates of strain where they
-    rest on something (docs/theory/mpm.md): of those only what turns counts.
-    """
+def count_calm(state: State, on_grid: Tensor, gravity: Tensor, dx: float) -> State:
+    """Count the frames during which points hardly moved."""
     p = state.particles
-    inner = p.affine if flip == 0.0 else 0.5 * (p.affine - p.affine.mT)
-    speed = p.velocity.norm(dim=1) + dx * torch.linalg.matrix_norm(inner)
+    speed = p.velocity.norm(dim=1) + dx * torch.linalg.matrix_norm(p.affine)
     slow = speed < CALM * float(gravity.norm() * dx) ** 0.5
     calm = torch.where(slow, state.calm + 1, torch.zeros_like(state.calm)).clamp(max=1000)
     return state._replace(calm=torch.where(on_grid, calm, state.calm))

@@ -13,7 +13,6 @@ from torch import Tensor
 from gsfluent.lab.problems.contact.contact import SPACING, YOUNG, bodies
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import ball, parameters, rotation
-from gsfluent.ops.solver import own_share
 
 RADIUS, FINE = 4.0, 8.0  # of the balls [dx]
 SPEED = 0.1  # of each [P-wave speed]
@@ -66,7 +65,7 @@ def brittle_impact(
     ahead = turn[:, 0]
     world = bodies(
         parts, [SPEED * ahead + frame, -SPEED * ahead + frame], law=NACC, alpha=alpha, cfl=cfl,
-        flip=own_share(cfl), params=parameters(YOUNG, 0.2, 1.0, c2=1.85, c3=0.3, c4=10.0, c5=0.05),
+        flip=1.0 - 2.0 * cfl, params=parameters(YOUNG, 0.2, 1.0, c2=1.85, c3=0.3, c4=10.0, c5=0.05),
         dtype=torch.float64, surface=0.5 if touch else None, touch=touch,
     )  # fmt: skip
     mass = world.scene.mass.cpu()

@@ -18,7 +18,6 @@ from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
 from gsfluent.lab.world.walls import wall
-from gsfluent.ops.solver import own_share
 
 REST = torch.zeros(3, dtype=torch.float64)
 
@@ -127,9 +126,8 @@ def balls_head_on_short() -> Iterator[Result]:
     """The same by shorter steps, points keeping what these would lose."""
     for cfl in (0.25, 0.125):
         for radius, bar in ((6.0, 0.05), (10.0, 0.03)):
-            share = own_share(cfl)
-            kept, most, _ = head_on(radius, cfl=cfl, flip=share)
-            note = f"0.05 c each; points push; keep {share:.2f} of their own motion"
+            kept, most, _ = head_on(radius, cfl=cfl, flip=1.0 - 2.0 * cfl)
+            note = f"0.05 c each; points push; keep {1.0 - 2.0 * cfl:g} of their own motion"
             yield from bounced(radius, bar, kept, most, note, f", CFL {cfl:g}")
 
 

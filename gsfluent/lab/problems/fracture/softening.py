@@ -18,7 +18,6 @@ from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, nacc, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
-from gsfluent.ops.solver import own_share
 from gsfluent.pipeline.matter.crack_band import crack_band, softening_energy
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
@@ -162,7 +161,7 @@ def open_cantilever(
         volume=volume, dx=dx, law=torch.tensor([0, 1]),
         params=torch.stack([parameters(YOUNG, POISSON, DENSITY), row]), material=layer.int(),
         alpha=torch.full_like(x, float(alpha0)), colliders=between_planes(dx), dtype=torch.float32,
-        force=wedge, cfl=cfl, flip=own_share(cfl),
+        force=wedge, cfl=cfl, flip=1.0 - 2.0 * cfl,
     )  # fmt: skip
     meter = Dissipation(world)
     world.run(seconds=crossings / c, each=meter)
