@@ -113,6 +113,21 @@ def test_calls_divide_a_run_without_a_trace(device: str) -> None:
     assert torch.allclose(whole.affine, parts.affine, rtol=0.0, atol=bar)
 
 
+def test_what_strains_is_the_gradient_at_the_nodes_and_not_what_points_keep() -> None:
+    with running_on("cpu", "ops"):
+        world = impact(flip=0.5, dt=0.2, deformation=True)
+    world.run(steps=20)
+    before = world.deformation
+    world.run(steps=1)
+    assert before is not None and world.deformation is not None
+    gradient = world.stepper.gradient
+    moved = before + 0.2 * gradient @ before
+    assert torch.allclose(world.deformation, moved, rtol=0.0, atol=1e-14)
+    assert float((gradient - world.affine).abs().max()) > 1e-4
+    with pytest.raises(NotImplementedError, match="gradient with flip"):
+        _ = impact(flip=0.5).stepper.gradient
+
+
 def test_shorter_steps_break_as_much() -> None:
     for result in placement.brittle_steps():
         assert result.passed, f"{result.quantity}: {result.value}"

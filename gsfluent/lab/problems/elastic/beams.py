@@ -118,7 +118,7 @@ def twist(cells: int) -> tuple[float, float, int]:
     return 0.5 / zeros(times, angles)[0], exact, world.steps
 
 
-@problem(tier="fast")
+@problem(tier="slow")
 def torsion() -> Iterator[Result]:
     """Half a swing of a square rod 4 cells across about its axis: frequency."""
     cells = 4
