@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsfluent.lab.problems.contact import contact, friction, observer, placement
+from gsfluent.lab.problems.contact import contact, edges, friction, observer, placement
 from gsfluent.lab.world.driver import running_on
 from gsfluent.lab.world.registry import Result
 
@@ -48,6 +48,17 @@ def test_head_on_balls_follow_hertz() -> None:
     holds(time)
     *_, transfer = contact.hertz_spheres(radius=6.0, one_field=True)
     assert restitution.value > transfer.value - 0.05  # contact itself takes next to nothing
+
+
+def test_cubes_that_meet_lose_less_on_a_finer_grid_and_where_points_push() -> None:
+    coarse, fine = edges.cubes(3)[0], edges.cubes(5)[0]
+    assert 0.84 < coarse < fine - 0.03
+    assert edges.cubes(3, touch=False)[0] < coarse - 0.05
+
+
+@pytest.mark.parametrize("cells", [4, 8])
+def test_plates_sink_by_about_a_cell_times_the_strain(cells: int) -> None:
+    assert 0.0 < edges.pressed(cells, 0.05) < 0.06
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.5])

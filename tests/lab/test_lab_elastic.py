@@ -30,6 +30,11 @@ def test_fast_problems_meet_their_tolerances(name: str) -> None:
     assert missed == []
 
 
+def test_a_thin_rod_twists_as_slowly_as_the_mass_that_the_grid_spreads_has_it() -> None:
+    alone, with_spread_mass = beams.torsion()
+    assert not alone.passed and with_spread_mass.passed
+
+
 def test_the_composed_ops_fail_where_absolute_float32_positions_must() -> None:
     # why the solver keeps a position as cell and offset
     with running_on("cpu", "ops"):

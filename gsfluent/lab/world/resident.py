@@ -100,6 +100,17 @@ class Resident:
         return result[2]
 
     @property
+    def gradient(self) -> Tensor:
+        """Gradient of the velocity at the nodes [1/s], [N, 3, 3]; matrices of APIC are that.
+
+        Raises:
+            NotImplementedError: Points keep a share of their own motion.
+        """
+        if self.scene.flip > 0.0:
+            raise NotImplementedError("World: gradient with flip is known by engine='ops' alone")
+        return self.solver.affine
+
+    @property
     def impulse(self) -> Tensor:
         """Given to the bodies by each collider so far [N s], float64 [K, 3]."""
         return self.solver.impulse if self._none.shape[0] else self._none

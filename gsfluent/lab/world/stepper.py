@@ -175,6 +175,7 @@ class Stepper:
     ):
         self.scene = scene
         self.position, self.velocity, self.affine = position, velocity, affine
+        self.gradient = affine  # of the velocity at the nodes, by which the last step strained
         self.strain, self.alpha, self.deformation = strain, alpha, deformation
         self.peak, self.viscous = alpha, scene.viscous
         self.cracks = DamageField(scene.law, scene.params, scene.material)
@@ -258,7 +259,8 @@ class Stepper:
                 f"{int(skipped)} points are not finite or left the grid after {self.steps} steps"
             )
         self.position = x[:count]
-        increment = dt * c[:count]
+        self.gradient = c[:count]
+        increment = dt * self.gradient
         if own is not None:
             # what moves by v and has another velocity would change its angular momentum
             spin = (-2.0 * dt / scene.dx**2) * torch.linalg.cross(v, own[0])

@@ -7,13 +7,12 @@ from collections.abc import Iterator
 import torch
 
 from gsfluent import ops
+from gsfluent.lab.problems.elastic.beams import TORSION
 from gsfluent.lab.problems.elastic.statics import FACE, slope
 from gsfluent.lab.world.driver import place
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box, parameters
 
-TORSION = 0.140577
-"""Torsion constant of a square over the fourth power of its edge (Saint-Venant)."""
 POISSON = 0.0  # grips hinder no contraction: the closed forms are exact
 FREE = 2.0  # length between the grips, in edges
 

@@ -22,7 +22,7 @@ class Dissipation:
 
     def __call__(self, world: World) -> None:
         """Add the work of the step just made."""
-        c, t = world.affine, self._stress
+        c, t = world.stepper.gradient, self._stress
         power = (
             t[:, 0] * c[:, 0, 0]
             + t[:, 1] * c[:, 1, 1]
