@@ -70,7 +70,8 @@ def measure(run: Run) -> Row:
         "pieces": len(ids), "now": sum(now), "held": sum(held),
         "rest": sum(blocks(rest[rows], matter.dx) for rows in parts),
         "small": len(small), "of_small": sum(now[i] for i in small),
-        "astray": int((~heaps).sum()), "points": int(on_grid.sum()), "loose": int(state.loose.sum()),
+        "astray": int((~heaps).sum()), "points": int(on_grid.sum()),
+        "loose": int(state.loose.sum()),
     }  # fmt: skip
 
 
