@@ -22,11 +22,11 @@ from gsfluent.pipeline.simulate.flight import Flight
 LANDING = 2.0
 """Distance [cells] at which a group is handed to the grid: the reach of the kernel (1.5) plus what
 it can move before the next look."""
-TAKE_OFF = 4.0
+TAKE_OFF = 2.5
 """Distance [cells] from everything at which a piece may leave the grid."""
 VIBRATION = 0.01
 """Largest share of a piece's kinetic energy that may lie in vibration (kinetic and elastic) when it
-takes off."""
+takes off; in a body that broke of kinetic energy alone."""
 CALM_FRAMES = 3
 """Frames in a row at rest before a group sleeps."""
 CALM = 0.02
