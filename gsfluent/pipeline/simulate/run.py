@@ -35,8 +35,8 @@ MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
 REGROUP = 16
 """Grid steps between two looks for new pieces within a frame while points break, at least. Until
-then both sides of a crack share a velocity field, and what lies between them is strewn over the
-gap: looks four times as rare make it half as much again, and blocks of the grid a quarter more."""
+then both sides of a crack share a velocity field, and what lies between them is strewn over the gap
+(docs/theory/fracture.md)."""
 RARELY, MANY = 192, 2000
 """Such a look is due when a 2000th of the points has broken since the last one, or after 192 steps
 when any has: on a GPU a look takes as long as a hundred steps, and what few points hold together
