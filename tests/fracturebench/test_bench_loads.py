@@ -57,6 +57,29 @@ def energies(keep: float) -> tuple[float, float, float]:
     return before, world.kinetic() + world.elastic(), float(account.transfer.sum())
 
 
+@pytest.mark.parametrize("through", [False, True])
+def test_two_fields_are_one_ahead_of_the_tip_and_part_behind_it(through: bool) -> None:
+    def pulled(sides: bool) -> World:
+        worlds: list[World] = []
+
+        def begin(world: World) -> None:
+            worlds.append(world)
+            account = loads.Account(world, sides=sides)
+            if through and sides:
+                account._fields._middle = 0.2
+                world.velocity = world.velocity + torch.where(
+                    world.position[:, 1:2] > 0.2, 1.0, -1.0
+                ) * torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64)
+                account._fields.tip = math.inf
+
+        run_case(cube(), dtype=torch.float64, cfl=0.2, engine="ops", setup=begin)
+        return worlds[0]
+
+    one, two = pulled(False), pulled(True)
+    away = float((one.position - two.position).abs().max())
+    assert (away > 1e-3) if through else (away < 1e-12)
+
+
 def test_the_account_closes_for_an_elastic_body() -> None:
     for keep in (0.0, 0.99):
         before, after, taken = energies(keep)

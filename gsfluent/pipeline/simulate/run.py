@@ -33,10 +33,8 @@ from gsfluent.scene.scene import Scene
 
 MOMENTUM_BAR = 1e-4
 """Relative error of the momentum balance that a run should stay below."""
-REGROUP = 16
-"""Grid steps between two looks for new pieces within a frame while points break, at least. Until
-then both sides of a crack share a velocity field, and what lies between them is strewn over the gap
-(docs/theory/fracture.md)."""
+REGROUP = 64
+"""Grid steps between two looks for new pieces within a frame."""
 RARELY, MANY = 192, 2000
 """Such a look is due when a 2000th of the points has broken since the last one, or after 192 steps
 when any has: on a GPU a look takes as long as a hundred steps, and what few points hold together
@@ -147,11 +145,10 @@ class Run:
         watch.keep(state, only=True)
         checked = grouped = regrouped = state.step
         broken, looked = self._broken(state), state.time
-        seen, wait = broken, REGROUP if broken else CHECK_EVERY
         while state.time < until:
             trouble: Unhealthy | None = None
             try:
-                left = min(CHECK_EVERY - (state.step - checked), wait - (state.step - grouped))
+                left = CHECK_EVERY - (state.step - checked)
                 state = self.impulses.given(state)
                 stop = min(until, self.impulses.next_change(state))
                 stop = min(stop, stepper.liquids.next_look(state.time))
@@ -175,16 +172,14 @@ class Run:
                 state = back
                 checked = grouped = regrouped = state.step
                 looked = min(looked, state.time)
-            elif state.step - grouped >= wait:
+            elif state.step - grouped >= REGROUP and checked == state.step:
                 grouped = state.step
-                now_broken = self._broken(state)
-                wait = REGROUP if now_broken != seen else CHECK_EVERY
-                seen, change = now_broken, abs(now_broken - broken)
+                change = abs(self._broken(state) - broken)
                 due = change * MANY >= len(state.peak) or state.step - regrouped >= RARELY
                 if change and due and self._moved(state, looked):
                     state, looked = self._regroup(state, at_frame=False), state.time
                     regrouped = state.step
-                    broken = seen = self._broken(state)  # some may have been welded
+                    broken = self._broken(state)  # some may have been welded
         self.state = state
         waits = [body.held and body.start > state.time for body in self.scene.bodies]
         if watch.implausible(state, waits, self.scene.floor):
