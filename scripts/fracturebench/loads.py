@@ -16,7 +16,7 @@ import contextlib
 import dataclasses
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -227,8 +227,8 @@ def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0
         rows_of_samples.append(np.array([work @ share, lost @ share, lost @ near]))
 
     run = run_case(
-        played, engine="ops", setup=lambda world: accounts.append(Account(world, keep, sides=sides)),
-        watch=look, **options,
+        played, engine="ops", watch=look, **options,
+        setup=lambda world: accounts.append(Account(world, keep, sides=sides)),
     )  # fmt: skip
     run = dataclasses.replace(run, x=run.x - shift)
     (judged,) = judge(scene, run)
