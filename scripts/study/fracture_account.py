@@ -123,7 +123,7 @@ class Account:
         return (1.0 - share[:, None]) * law, share[:, None] * held
 
 
-def study(trial: Trial, cells: int, seed: int, device: str) -> Row:
+def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     """A fall and its account."""
     begun = time.perf_counter()
     account = Account()
