@@ -21,8 +21,11 @@ from gsfluent.scene.scene import Body
 
 THIN_CELLS = 4.0
 """Cells that the thinnest part of a body needs for bending to be felt (solver.md: 4 to 6)."""
-PIECE_CELLS = 3.0
-"""Cells that a piece needs to be one, and that a damage length must hold."""
+PIECE_CELLS = 8.0
+"""Cells along a piece from which the number of pieces is that of finer grids, within a quarter: two
+on each side of it are the band of a crack (docs/measured/fracture_resolution.md)."""
+DAMAGE_CELLS = 3.0
+"""Cells that a damage length must hold."""
 CELLS = (8, 512)
 """Fewest and most cells along the largest body that a budget is turned into."""
 
@@ -71,12 +74,15 @@ def bounds_of(
         need("thinnest part", thin, THIN_CELLS, why)
         piece = fragment_size(body, strike)
         if piece is not None:
-            why = f"{body.name}: pieces of about {_length(piece)}, {PIECE_CELLS:g} cells each"
+            why = (
+                f"{body.name}: pieces of about {_length(piece)}, {PIECE_CELLS:g} cells each; "
+                "coarser cells make fewer and larger ones"
+            )
             need("fragment size", piece, PIECE_CELLS, why)
         material = body.material
         if material.variation > 0.0 and material.grain > 0.0 and material.law in BREAKS:
             why = f"{body.name}: strength varies over {_length(material.grain)}, "
-            need("damage length", material.grain, PIECE_CELLS, f"{why}{PIECE_CELLS:g} cells")
+            need("damage length", material.grain, DAMAGE_CELLS, f"{why}{DAMAGE_CELLS:g} cells")
     found.sort(key=lambda bound: bound.dx)
     binding = found[0].name if found else "none"
     if budget is not None:

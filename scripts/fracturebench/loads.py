@@ -2,6 +2,7 @@
 
     python scripts/fracturebench/loads.py [--quick] [--only NAME,...]
     python scripts/fracturebench/loads.py --only grid_place --cases rock_press   # one row anew
+    python scripts/fracturebench/loads.py --only cantilever_account --cases "on each side"
 
 Speed of the notch's crack with light and heavy grips at two CFL numbers and two speeds of
 tearing, energy that the cantilever's crack takes at three speeds of opening and where it goes in
@@ -12,11 +13,14 @@ shapes of the pieces of struck rock on three grids (six minutes on one core).
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -78,17 +82,19 @@ class Account:
         world: A world on the composable ops, before its first step.
         keep: Share of what the transfer took off a point's velocity that it gets back: 0 is APIC,
             1 is FLIP with affine velocities (Fei et al. 2021); points still move by the nodes'.
+        sides: Give both sides of a crack a field (:class:`Sides`).
 
     Raises:
         TypeError: The world runs in the solver.
     """
 
-    def __init__(self, world: World, keep: float = 0.0) -> None:
+    def __init__(self, world: World, keep: float = 0.0, *, sides: bool = False) -> None:
         if not isinstance(world.stepper, Stepper):
             raise TypeError("Account: the world must run on the ops; give it engine='ops'")
         self.plastic = Dissipation(world)
         self.transfer = torch.zeros_like(world.position[:, 0], dtype=torch.float64)
         self._world, self._keep, self._step = world, keep, world.stepper.advance
+        self._fields = Sides(world) if sides else contextlib.nullcontext
         world.stepper.advance = self._advance  # type: ignore[method-assign]
 
     def _kinetic(self) -> Tensor:
@@ -98,6 +104,10 @@ class Account:
         return 0.5 * scene.mass.double() * ((world.velocity.double() ** 2).sum(1) + spin)
 
     def _advance(self, dt: float) -> None:
+        with self._fields():
+            self._accounted(dt)
+
+    def _accounted(self, dt: float) -> None:
         world, scene = self._world, self._world.scene
         v, x, where = world.velocity, world.position, {"dx": scene.dx, "dt": dt}
         blocks = ops.build_blocks(x, scene.dx)
@@ -128,6 +138,53 @@ class Account:
         self.plastic(world)
 
 
+class Sides:
+    """A velocity field on each side of a crack that runs along x, up to its tip.
+
+    What fields told apart by the gradient of damage would do (Homel and Herbold 2017), with the
+    crack's place known: a point is above or below the broken points of its column. Ahead of the tip
+    both fields have one velocity at every node, and meet by contact behind it.
+
+    Args:
+        world: A world on the composable ops, before its first step.
+    """
+
+    def __init__(self, world: World) -> None:
+        self._world, self._rest = world, world.position.clone()
+        y = self._rest[:, 1]
+        self._middle = 0.5 * (y.min() + y.max())
+        self._column = torch.floor(self._rest[:, 0] / world.scene.dx).long()
+        self._plain = {name: getattr(ops, name) for name in ("p2g", "g2p")}
+
+    @contextlib.contextmanager
+    def __call__(self) -> Iterator[None]:
+        """Transfers by two fields, for one step."""
+        dx, y = self._world.scene.dx, self._rest[:, 1]
+        broken = ((self._world.peak >= 0.0) & (self._world.scene.material == 1)).nonzero()[:, 0]
+        column, least = self._column[broken], int(self._column.min())
+        count = torch.bincount(column - least, minlength=int(self._column.max()) - least + 1)
+        total = torch.zeros_like(count, dtype=y.dtype).index_add(0, column - least, y[broken])
+        line = torch.where(count > 0, total / count.clamp(min=1), self._middle)
+        self._body = (y > line[self._column - least]).int()
+        self._tip = dx * float(column.max() + 1) if len(broken) else -math.inf
+        with patch.object(ops, "p2g", self._to_nodes), patch.object(ops, "g2p", self._to_points):
+            yield
+
+    def _to_nodes(self, *points: Any, **options: Any) -> Any:
+        options |= {"body": self._body, "fields": 2, "contact": True}
+        grid, moments = self._plain["p2g"](*points, **options)
+        place = options["blocks"].node_positions(options["dx"], grid.dtype)[..., 0]
+        ahead = place >= self._tip
+        both = grid.sum(0)
+        shared = both[..., :3] / both[..., 3:].clamp(min=1e-30)
+        grid = grid.clone()
+        grid[..., :3] = torch.where(ahead[..., None], grid[..., 3:] * shared, grid[..., :3])
+        return grid, moments
+
+    def _to_points(self, *nodes: Any, **options: Any) -> Any:
+        return self._plain["g2p"](*nodes, **{**options, "body": self._body})
+
+
 @dataclasses.dataclass(frozen=True)
 class Balance:
     """Energy per area of the cantilever's crack [J/m^2], each the slope over the crack's length."""
@@ -140,8 +197,8 @@ class Balance:
     cracks: float  # side by side: their length over the way of the tip
 
 
-def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0.0, **options: Any
-            ) -> Balance:  # fmt: skip
+def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0.0,
+            sides: bool = False, **options: Any) -> Balance:  # fmt: skip
     """Open the cantilever and say where its energy went.
 
     Args:
@@ -149,6 +206,7 @@ def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0
         place: Of the points on the grid across the crack [dx].
         band: Cells that the softening is spread over: the row's own is 2.
         keep: Of :class:`Account`.
+        sides: Likewise.
         **options: Of :func:`gsfluent.lab.frozen.answer.run_case`.
     """
     scene = find("double_cantilever").build(dx, 8)
@@ -170,8 +228,8 @@ def balance(dx: float, *, place: float = 0.0, band: float = 2.0, keep: float = 0
         rows_of_samples.append(np.array([work @ share, lost @ share, lost @ near]))
 
     run = run_case(
-        played, engine="ops", setup=lambda world: accounts.append(Account(world, keep)),
-        watch=look, **options,
+        played, engine="ops", watch=look, **options,
+        setup=lambda world: accounts.append(Account(world, keep, sides=sides)),
     )  # fmt: skip
     run = dataclasses.replace(run, x=run.x - shift)
     (judged,) = judge(scene, run)
@@ -196,17 +254,27 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     *((f"transfer keeps 90%, grid {p:g} cells off", {"keep": 0.9, "place": p})
       for p in (0.25, 0.5)),
     ("softening for a band of 3 cells, transfer keeps 99%", {"band": 3.0, "keep": 0.99}),
+    *((f"a field on each side of the crack, grid {p:g} cells off", {"sides": True, "place": p})
+      for p in (0.125, 0.25, 0.375)),
+    ("a field on each side of the crack, grid 0.25 cells off, dx = 1/48 m",
+     {"sides": True, "place": 0.25, "dx": 1.0 / 48.0}),
+    ("a field on each side of the crack, grid 0.25 cells off, softening for a band of 1.5 cells",
+     {"sides": True, "place": 0.25, "band": 1.5}),
 )  # fmt: skip
 
 
-def accounts(quick: bool) -> list[str]:
-    """Rows of the table of where the cantilever's energy goes."""
+def accounts(quick: bool, only: Sequence[str] = ()) -> list[str]:
+    """Rows of the table of where the cantilever's energy goes; arguments as of :func:`places`."""
+    known = {row.split(" | ")[0]: row for row in PAGE.read_text(encoding="utf-8").splitlines()}
     rows = [
         "| setting | cracks | energy gone | over that of the row | plastic work | taken by the "
         "transfer | of it where matter can break |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, options in SETTINGS[: 1 if quick else None]:
+        if only and f"| {name}" in known and not any(part in name for part in only):
+            rows.append(known[f"| {name}"])
+            continue
         b = balance(**{"dx": 1.0 / 32.0, **options})
         rows.append(
             f"| {name} | {b.cracks:.1f} | {b.gone:.0f} J/m^2 | {b.gone / b.reference:.2f} | "
@@ -288,10 +356,13 @@ def shapes(quick: bool) -> list[str]:
     return rows
 
 
+CHOSEN: dict[str, Callable[[bool, Sequence[str]], list[str]]] = {
+    "cantilever_account": accounts, "grid_place": places,
+}  # fmt: skip
+"""Tables of which some rows may be run, the others being those of the page."""
 TABLES: dict[str, Callable[[bool], list[str]]] = {
     "notch_loads": speeds, "cantilever_loads": energies, "cantilever_account": accounts,
-    "grid_place": places,
-    "rock_strength": strengths, "rock_shapes": shapes,
+    "grid_place": places, "rock_strength": strengths, "rock_shapes": shapes,
 }  # fmt: skip
 
 
@@ -302,7 +373,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--quick", action="store_true", help="one row of each, printed only")
     parser.add_argument("--only", default=",".join(TABLES), help="some of %(default)s")
-    parser.add_argument("--cases", default="", help="of grid_place: only these are run")
+    parser.add_argument("--cases", default="", help=f"of {', '.join(CHOSEN)}: only these are run")
     args = parser.parse_args(argv)
     names = args.only.split(",")
     if unknown := set(names) - set(TABLES):
@@ -311,7 +382,7 @@ def main(argv: list[str] | None = None) -> int:
         )
     some = [name for name in args.cases.split(",") if name]
     tables = {
-        name: places(args.quick, some) if name == "grid_place" else TABLES[name](args.quick)
+        name: CHOSEN[name](args.quick, some) if name in CHOSEN else TABLES[name](args.quick)
         for name in names
     }
     if args.quick:

@@ -2,6 +2,7 @@
 
     python scripts/study/fracture_account.py               # ten minutes of one core; resumable
     python scripts/study/fracture_account.py --cells 16 --heights 3
+    python scripts/study/fracture_account.py --cells 24,32,40 --device cuda    # three minutes
 
 The watermelon of ``fracture_resolution.py``, step by step. The law's stress and that of the
 relaxing spring work on the velocity gradient of every point; what of the work is not stored is
@@ -55,7 +56,7 @@ class Account:
     def begin(self, matter: Matter, state: State) -> None:
         """Take the points that are to be watched."""
         self.matter = matter
-        none = torch.zeros(matter.particles.count, dtype=torch.float64)
+        none = torch.zeros_like(matter.particles.mass, dtype=torch.float64)
         self.torn, self.pressed, self.relaxed = none, none.clone(), none.clone()
         self._elastic = torch.full_like(matter.law, LAWS["elastic"])
         self._plain = torch.zeros_like(matter.params)
@@ -122,12 +123,12 @@ class Account:
         return (1.0 - share[:, None]) * law, share[:, None] * held
 
 
-def study(trial: Trial, cells: int, seed: int) -> Row:
+def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     """A fall and its account."""
     begun = time.perf_counter()
     account = Account()
     sim = Simulate(
-        dx=2.0 * max(trial.half) / cells, seed=seed, repair=False, splats=False, device="cpu",
+        dx=2.0 * max(trial.half) / cells, seed=seed, repair=False, splats=False, device=device,
         step_hook=account,
     )  # fmt: skip
     steps = sim(trial.scene(), fps=100.0, seconds=trial.begins + trial.seconds + 0.011)
@@ -145,8 +146,8 @@ def study(trial: Trial, cells: int, seed: int) -> Row:
     area = int(between.sum()) * link_area(run.links, matter.rest, float(volume.sum()))
     shares = frame.pieces.mass_fractions
     return {
-        "height": trial.height, "cells": cells, "seed": seed, "device": "cpu",
-        "machine": machine("cpu"), "dx": matter.dx, "points": matter.particles.count,
+        "height": trial.height, "cells": cells, "seed": seed, "device": device,
+        "machine": machine(device), "dx": matter.dx, "points": matter.particles.count,
         "dissipated": report["per_frame"]["dissipated"][-1],
         "torn": float(account.torn[ever].sum()), "pressed": float(account.pressed[ever].sum()),
         "yielded": float((account.torn + account.pressed)[~ever].sum()),
@@ -192,6 +193,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--cells", type=numbers, default=(12, 16, 20, 24))
     parser.add_argument("--heights", type=float, nargs="+", default=[0.75, 3.0])
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     args = parser.parse_args(argv)
     done = {(r["height"], r["cells"], r["seed"]) for r in read(args.out)}
     for cells in args.cells:
@@ -199,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
             for seed in range(args.seeds):
                 if (height, cells, seed) in done:
                     continue
-                row = study(dataclasses.replace(MELON, height=height), cells, seed)
+                row = study(dataclasses.replace(MELON, height=height), cells, seed, args.device)
                 sys.stderr.write(f"{json.dumps(row)}\n")
                 with args.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 from loaded_scripts import load_script
 
+from gsfluent import ops
 from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.shapes import box, elastic, free, plane
@@ -55,6 +58,35 @@ def energies(keep: float) -> tuple[float, float, float]:
     scene = cube()
     before = 0.5 * float((scene.mass * (scene.v**2).sum(axis=1)).sum())
     return before, world.kinetic() + world.elastic(), float(account.transfer.sum())
+
+
+def test_two_fields_are_one_ahead_of_the_tip_and_part_behind_it() -> None:
+    worlds: list[World] = []
+    for sides in (False, True):
+
+        def begin(world: World, sides: bool = sides) -> None:
+            worlds.append(world)
+            loads.Account(world, sides=sides)
+
+        run_case(cube(), dtype=torch.float64, cfl=0.2, engine="ops", setup=begin)
+    one, two = worlds  # nothing is broken: all is ahead of the tip
+    assert float((one.position - two.position).abs().max()) < 1e-12
+
+    fields = loads.Sides(one)
+    with fields():
+        pass
+    points = (one.position, one.velocity, one.affine, one.scene.mass)
+    where = {"dx": DX, "blocks": ops.build_blocks(one.position, DX)}
+    shared = ops.p2g(*points, **where)[0]
+    found = {}
+    for tip in (-math.inf, math.inf):
+        fields._tip = tip
+        grid, _ = fields._to_nodes(*points, **where)
+        assert torch.allclose(grid.sum(0), shared[0], rtol=1e-12, atol=1e-15)
+        both = (grid[..., 3] > 1e-9).all(0)
+        v = grid[:, both, :3] / grid[:, both, 3:]
+        found[tip] = float((v[0] - v[1]).abs().max())
+    assert found[-math.inf] < 1e-12 and found[math.inf] > 0.1
 
 
 def test_the_account_closes_for_an_elastic_body() -> None:

@@ -10,7 +10,7 @@ import torch
 
 from gsfluent.lab.problems.elastic.paths import breaking_step
 from gsfluent.lab.problems.flow import granular, liquid
-from gsfluent.lab.problems.fracture import notch, spall
+from gsfluent.lab.problems.fracture import energy, notch, spall
 from gsfluent.lab.world import registry
 from gsfluent.lab.world.shapes import nacc
 from gsfluent.pipeline.matter.crack_band import (
@@ -41,6 +41,18 @@ def test_a_weaker_impact_does_not_spall() -> None:
     assert math.isnan(plane.value) and not plane.passed
     # the whole pulse comes out: the face stops, so the "strength" is the impact stress
     assert strength.value == pytest.approx(0.9 * strength.reference, rel=0.05)
+
+
+def test_peak_of_a_notched_beam_has_the_limits_of_toughness_and_of_strength() -> None:
+    tough = 1e-5  # of E G_c / s^2 beside a depth of 1 m: linear elastic fracture mechanics
+    held = math.sqrt(energy.YOUNG / (1 - energy.POISSON**2) * energy.fracture_energy(tough))
+    # P S f / (B D^1.5) = K_c with f = 1.339 at a quarter's depth and a span of 4 (ASTM E399)
+    assert energy.beam_peak(tough, span=4.0) == pytest.approx(held / (4.0 * 1.339), rel=1e-3)
+    peaks = [energy.beam_peak(length) for length in (0.05, 0.5, 5.0, 5e3)]
+    assert peaks == sorted(peaks)
+    # where toughness asks for nothing: the ligament at its strength, elastic to plastic
+    ligament = 2.0 * energy.TENSILE * 0.75**2 / (3.0 * 3.0)
+    assert ligament < peaks[-1] < 1.5 * ligament
 
 
 def test_watermelon_of_cohesion_one_breaks_in_shear_only_with_shear_damage() -> None:
