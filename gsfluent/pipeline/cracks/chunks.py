@@ -138,6 +138,7 @@ class Chunks:
         self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
+            self._drives[state["idle"].to(device)] = False
             if "dust" in state:
                 self._dust.resume(state["dust"])
             self._relink()
@@ -154,6 +155,7 @@ class Chunks:
                 for event in self._events
             ],
             "crumbs": self._crumb.nonzero()[:, 0].cpu(),
+            "idle": (~self._drives).nonzero()[:, 0].cpu(),
             "gaps": self._gaps.state(),
             "dust": self._dust.state(),
             "steps": self._steps,
@@ -194,14 +196,31 @@ class Chunks:
         """
         count = self._chunk.shape[0]
         unit = points.unit if points.unit is not None else points.fragments.long()
-        unit = unit[:count]
+        unit, unsplit = unit[:count], None
         if self._unit is None or not torch.equal(unit, self._unit):
             self._unit = unit
-            before = self._chunk
+            before, splits, unsplit = self._chunk, len(self._events), self._twin()
             self._look(unit)
             if self._chunk is not before:
                 self._relink()
+            # nobody saw what was before the first frame
+            if len(self._events) == splits or self._steps == 0:
+                unsplit = None
         self._steps += 1
+        cracks = self._cracks(points)
+        if unsplit is None:
+            return cracks
+        return cracks._replace(unsplit=unsplit._cracks(points))
+
+    def _twin(self) -> Chunks:
+        """The same, to go on from here in another way."""
+        other = copy.copy(self)
+        other._cuts, other._events = list(self._cuts), list(self._events)
+        other._gaps, other._dust = self._gaps.twin(), self._dust.twin()
+        return other
+
+    def _cracks(self, points: Points) -> Cracks:
+        """The cracks of a frame, as regions are now."""
         shown, carry = self._moved(points), self._carry(points)
         self._dust.step(points.position, shown.position)
         self._gaps.rebind(carry)

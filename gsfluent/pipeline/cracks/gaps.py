@@ -7,9 +7,10 @@ little of it changes from one frame to the next. It is part of a saved run (:met
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,6 +23,9 @@ from gsfluent.pipeline.cracks.faces import DEBRIS, PIECE, Elements, Fit, find_el
 from gsfluent.pipeline.cracks.sites import Sites
 from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.links import BACK, FULL, OPEN, Hanging
+
+if TYPE_CHECKING:
+    from gsfluent.pipeline.cracks.ease import Easing
 
 OPACITY = 0.98
 """Opacity of a face element where the gap is wide."""
@@ -67,6 +71,9 @@ class Cracks(NamedTuple):
         dust: Material points that are drawn as dust, int64 [D]; None where there are none.
         lent: Points whose matter is drawn with another piece than theirs, int64 [L], and where
             that is [m], [L, 3]; None where there are none.
+        unsplit: This moment as it would be without the splits of it; None where there are none.
+        easing: Splats that are still on their way from how they were drawn before splits; None
+            where there are none.
     """
 
     points: Points
@@ -75,6 +82,8 @@ class Cracks(NamedTuple):
     carry: Carry
     dust: Tensor | None = None
     lent: tuple[Tensor, Tensor] | None = None
+    unsplit: Cracks | None = None
+    easing: Easing | None = None
 
 
 class Gaps:
@@ -109,6 +118,12 @@ class Gaps:
     def state(self) -> dict[str, Any]:
         """What a later run needs to go on from here."""
         return {} if self._before is None else self._before.state()
+
+    def twin(self) -> Gaps:
+        """The same, to go on from here in another way."""
+        other = copy.copy(self)
+        other._stale = self._stale.clone()
+        return other
 
     def rebind(self, carry: Carry) -> None:
         """Go on with a binding of the same splats in which some points have other neighbours."""
