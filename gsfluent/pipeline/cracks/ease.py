@@ -19,7 +19,7 @@ from gsfluent.data import Gaussians
 from gsfluent.pipeline.cracks.gaps import Cracks
 from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 
-FRAMES = 5
+FRAMES = 8
 """Frames after a split in which its picture comes to be; the first shows nothing of it."""
 FAR = 1.5
 """Splats do not cross a crack that is wider than this [spacings]: they go here and come there."""
@@ -108,7 +108,7 @@ class Easing(NamedTuple):
         if gone.numel() == 0:
             return drawn
         last = old.select(gone)
-        there = (2.0 * (1.0 - share[gone])).clamp(max=1.0)
+        there = (1.5 * (1.0 - share[gone])).clamp(max=1.0).square()
         last = last.replace(opacities=last.opacities * there)
         return Drawn(
             Gaussians.cat([drawn.gaussians, last]),
