@@ -72,10 +72,9 @@ class Easing(NamedTuple):
 
     def state(self) -> dict[str, Any]:
         """As plain tensors."""
-        flat = self._replace(before=vars(self.before))._asdict()
-        cpu = {k: v.cpu() for k, v in flat.items() if torch.is_tensor(v)}
-        kept = {k: v.cpu() for k, v in flat["before"].items() if torch.is_tensor(v)}
-        return cpu | {"before": kept}
+        own = {k: v.cpu() for k, v in self._asdict().items() if torch.is_tensor(v)}
+        kept = {k: v.cpu() for k, v in vars(self.before).items() if torch.is_tensor(v)}
+        return own | {"before": kept}
 
     @staticmethod
     def restored(state: dict[str, Any], device: torch.device) -> Easing:
