@@ -32,6 +32,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
+from gsfluent.pipeline.cracks.ease import PARTS
 from gsfluent.pipeline.cracks.followers import (
     WIDE,
     Followers,
@@ -40,6 +41,7 @@ from gsfluent.pipeline.cracks.followers import (
     held,
     motions,
     neighbours,
+    parted,
     stiff,
 )
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
@@ -117,6 +119,7 @@ class Chunks:
         self._follow: Followers | None = None
         self._unbroken: Followers | None = None
         self._unit: Tensor | None = None
+        self._last: Tensor | None = None
         self._faces: ChunkFaces | None = None
         self._cuts: list[ChunkCuts] = []
         self._region = self.base.body.clone()
@@ -139,6 +142,8 @@ class Chunks:
         if state:
             self._crumb[state["crumbs"].to(device)] = True
             self._drives[state["idle"].to(device)] = False
+            last = state["last"]
+            self._last = None if last is None else last.to(device)
             if "dust" in state:
                 self._dust.resume(state["dust"])
             self._relink()
@@ -156,6 +161,7 @@ class Chunks:
             ],
             "crumbs": self._crumb.nonzero()[:, 0].cpu(),
             "idle": (~self._drives).nonzero()[:, 0].cpu(),
+            "last": None if self._last is None else self._last.cpu(),
             "gaps": self._gaps.state(),
             "dust": self._dust.state(),
             "steps": self._steps,
@@ -196,21 +202,22 @@ class Chunks:
         """
         count = self._chunk.shape[0]
         unit = points.unit if points.unit is not None else points.fragments.long()
-        unit, unsplit = unit[:count], None
+        unit, unsplit, parting = unit[:count], None, PARTS
         if self._unit is None or not torch.equal(unit, self._unit):
             self._unit = unit
             before, splits, unsplit = self._chunk, len(self._events), self._twin()
             self._look(unit)
             if self._chunk is not before:
                 self._relink()
-            # nobody saw what was before the first frame
-            if len(self._events) == splits or self._steps == 0:
-                unsplit = None
+            if len(self._events) > splits and self._last is not None:
+                chunks = before, self._chunk
+                parting = parted(self.base.links, chunks, points.position, self._last)
         self._steps += 1
+        self._last = points.position[:count].clone()
         cracks = self._cracks(points)
-        if unsplit is None:
+        if unsplit is None or not parting < PARTS:
             return cracks
-        return cracks._replace(unsplit=unsplit._cracks(points))
+        return cracks._replace(unsplit=unsplit._cracks(points), parting=parting)
 
     def _twin(self) -> Chunks:
         """The same, to go on from here in another way."""

@@ -16,29 +16,20 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
-from gsfluent.pipeline.cracks.gaps import Cracks
+from gsfluent.pipeline.cracks.gaps import Cracks, Drawn
 from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 
 FRAMES = 8
-"""Frames after a split in which its picture comes to be; the first shows nothing of it."""
+"""Frames in which the picture of a split comes to be where its faces stand still; the first shows
+nothing of it."""
+PARTS = 2.0
+"""Way [spacings] that faces part in which it comes to be in any case: what flies apart is not seen
+to change, and must not be dragged along."""
 FAR = 1.5
 """Splats do not cross a crack that is wider than this [spacings]: they go here and come there."""
 _SAME = 1e-3  # of a spacing, or of a map: below it nothing has changed
+_WHOLE = 1.0 - 1e-6  # a sum of paces
 _ALIKE = 0.02  # of a spacing, of the shape, of opacities: below it nobody sees a change
-
-
-class Drawn(NamedTuple):
-    """Splats of one moment.
-
-    Attributes:
-        gaussians: In scene coordinates, [M].
-        ids: Number of each, none twice, int64 [M].
-        anchor: Point of each, int64 [M].
-    """
-
-    gaussians: Gaussians
-    ids: Tensor
-    anchor: Tensor
 
 
 class Easing(NamedTuple):
@@ -46,28 +37,33 @@ class Easing(NamedTuple):
 
     Attributes:
         ids: Those that were drawn otherwise before, ascending, int64 [K].
-        age: Frames since, int64 [K].
+        done: Part of the way that is done, [K].
+        pace: Part that is done in a frame, [K].
         anchor: Point that each of them goes with, int64 [K].
         before: How they were drawn, in coordinates of the matter at their point, [K].
         coming: Those that were not there, ascending, int64 [J].
-        young: Frames since they are, int64 [J].
+        there: Part of the way that is done, [J].
+        haste: Part that is done in a frame, [J].
     """
 
     ids: Tensor
-    age: Tensor
+    done: Tensor
+    pace: Tensor
     anchor: Tensor
     before: Gaussians
     coming: Tensor
-    young: Tensor
+    there: Tensor
+    haste: Tensor
 
     def older(self) -> Easing | None:
         """One frame later; None when all is done."""
-        keep, new = (age + 1 < FRAMES for age in (self.age, self.young))
+        done, there = self.done + self.pace, self.there + self.haste
+        keep, new = done < _WHOLE, there < _WHOLE
         if not bool(keep.any()) and not bool(new.any()):
             return None
         return Easing(
-            self.ids[keep], self.age[keep] + 1, self.anchor[keep], self.before.select(keep),
-            self.coming[new], self.young[new] + 1,
+            self.ids[keep], done[keep], self.pace[keep], self.anchor[keep],
+            self.before.select(keep), self.coming[new], there[new], self.haste[new],
         )  # fmt: skip
 
     def state(self) -> dict[str, Any]:
@@ -83,7 +79,7 @@ class Easing(NamedTuple):
         rest = {k: v.to(device) for k, v in state.items() if k != "before"}
         return Easing(**rest, before=before)
 
-    def apply(self, drawn: Drawn, carry: Carry, points: Points, *, leaving: bool = True) -> Drawn:
+    def apply(self, drawn: Drawn, carry: Carry, points: Points, leaving: bool = True) -> Drawn:
         """Splats as they are on the way.
 
         Args:
@@ -93,14 +89,14 @@ class Easing(NamedTuple):
             leaving: Whether to add those that are there no longer.
         """
         splats = drawn.gaussians
-        share = self.age.to(splats.means) / FRAMES
+        share = self.done.to(splats.means)
         old = _placed(self.before, self.anchor, carry, points)
         rows, k = _matches(drawn.ids, self.ids)
         if rows.numel():
             edge = carry.links.spacing[drawn.anchor[rows]]
             splats = _between(splats, rows, old.select(k), share[k], FAR * edge)
         rows, k = _matches(drawn.ids, self.coming)
-        there = (2.0 * self.young[k].to(splats.means) / FRAMES).clamp(max=1.0)
+        there = (2.0 * self.there[k].to(splats.means)).clamp(max=1.0)
         opacity = splats.opacities.index_copy(0, rows, splats.opacities[rows] * there)
         drawn = drawn._replace(gaussians=splats.replace(opacities=opacity))
         gone = (~torch.isin(self.ids, drawn.ids)).nonzero()[:, 0] if leaving else rows[:0]
@@ -145,18 +141,23 @@ def begun(before: Cracks, after: Cracks, easing: Easing | None) -> Easing:
     was = old.gaussians.select(which)
     was = was.replace(sh=was.sh[:, :1])
     held = _held(was, anchor, after.carry, after.points)
-    ids, age = old.ids[which], torch.zeros_like(which)
-    coming = new.ids[~torch.isin(new.ids, old.ids)]
-    young = torch.zeros_like(coming)
+    ids, coming = old.ids[which], new.ids[~torch.isin(new.ids, old.ids)]
+    begin = after.parting / PARTS
+    step = begin + 1.0 / FRAMES
+    each = [was.means.new_full((len(n),), v) for n in (ids, coming) for v in (begin, step)]
+    done, pace, there, haste = each
     if easing is not None:
         go_on = ~torch.isin(easing.ids, torch.cat([old.ids, new.ids]))
-        ids, age = torch.cat([ids, easing.ids[go_on]]), torch.cat([age, easing.age[go_on]])
-        anchor = torch.cat([anchor, easing.anchor[go_on]])
+        ids, done, pace, anchor = (
+            torch.cat([mine, theirs[go_on]])
+            for mine, theirs in zip((ids, done, pace, anchor), easing[:4], strict=True)
+        )
         held = Gaussians.cat([held, easing.before.select(go_on)])
     order, sort = ids.argsort(), coming.argsort()
     return Easing(
-        ids[order], age[order], anchor[order], held.select(order), coming[sort], young[sort]
-    )
+        ids[order], done[order], pace[order], anchor[order], held.select(order),
+        coming[sort], there[sort], haste[sort],
+    )  # fmt: skip
 
 
 def _touched(before: Cracks, after: Cracks) -> Tensor:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,9 +23,6 @@ from gsfluent.pipeline.cracks.faces import DEBRIS, PIECE, Elements, Fit, find_el
 from gsfluent.pipeline.cracks.sites import Sites
 from gsfluent.pipeline.matter.carry import Carry, Points
 from gsfluent.pipeline.matter.links import BACK, FULL, OPEN, Hanging
-
-if TYPE_CHECKING:
-    from gsfluent.pipeline.cracks.ease import Easing
 
 OPACITY = 0.98
 """Opacity of a face element where the gap is wide."""
@@ -60,6 +57,20 @@ class Births(NamedTuple):
         return cls(gaussians, ids, anchor)
 
 
+class Drawn(NamedTuple):
+    """Splats of one moment.
+
+    Attributes:
+        gaussians: In scene coordinates, [M].
+        ids: Number of each, none twice, int64 [M].
+        anchor: Material point that each follows, int64 [M].
+    """
+
+    gaussians: Gaussians
+    ids: Tensor
+    anchor: Tensor
+
+
 class Cracks(NamedTuple):
     """The cracks of one moment.
 
@@ -71,9 +82,11 @@ class Cracks(NamedTuple):
         dust: Material points that are drawn as dust, int64 [D]; None where there are none.
         lent: Points whose matter is drawn with another piece than theirs, int64 [L], and where
             that is [m], [L, 3]; None where there are none.
-        unsplit: This moment as it would be without the splits of it; None where there are none.
-        easing: Splats that are still on their way from how they were drawn before splits; None
-            where there are none.
+        unsplit: This moment as it would be without the splits of it; None where there are none, or
+            their faces part too fast for anybody to see the difference.
+        parting: How far these have parted since the last moment [spacings].
+        ease: What puts splats on their way that were drawn otherwise before splits; None where
+            there are none.
     """
 
     points: Points
@@ -83,7 +96,8 @@ class Cracks(NamedTuple):
     dust: Tensor | None = None
     lent: tuple[Tensor, Tensor] | None = None
     unsplit: Cracks | None = None
-    easing: Easing | None = None
+    parting: float = 0.0
+    ease: Callable[[Drawn, Carry, Points], Drawn] | None = None
 
 
 class Gaps:

@@ -22,8 +22,8 @@ from torch import Tensor
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.chunks import Chunks
-from gsfluent.pipeline.cracks.ease import Drawn, Easing, begun
-from gsfluent.pipeline.cracks.gaps import Cracks, Gaps
+from gsfluent.pipeline.cracks.ease import Easing, begun
+from gsfluent.pipeline.cracks.gaps import Cracks, Drawn, Gaps
 from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
 from gsfluent.pipeline.liquid.parts import LiquidParts
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
@@ -191,7 +191,7 @@ class CrackHistory:
         if cracks.unsplit is not None:
             easing = begun(cracks.unsplit, cracks, easing)
         self._easing = easing
-        return cracks._replace(unsplit=None, easing=easing)
+        return cracks._replace(unsplit=None, ease=None if easing is None else easing.apply)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs besides the points: plain tensors."""
@@ -214,15 +214,15 @@ class CrackHistory:
 
 
 def _with_births(moved: Gaussians, motion: Motion, cracks: Cracks) -> Repaired:
-    births, easing = cracks.births, cracks.easing
-    if births is None and easing is None:
+    births = cracks.births
+    if births is None and cracks.ease is None:
         return Repaired.none(moved, motion.anchor)
     rows = torch.arange(moved.count, device=moved.device)
     drawn = Drawn(moved, rows, motion.anchor)
     if births is not None:
         pairs = zip(drawn[1:], births[1:], strict=True)
         drawn = Drawn(Gaussians.cat([moved, births.gaussians]), *(torch.cat(p) for p in pairs))
-    if easing is not None:
-        drawn = easing.apply(drawn, cracks.carry, motion.points)
+    if cracks.ease is not None:
+        drawn = cracks.ease(drawn, cracks.carry, motion.points)
     groups = torch.full_like(drawn.ids, -1, dtype=torch.int32)
     return Repaired(drawn.gaussians, groups, len(groups) - moved.count, drawn.ids, drawn.anchor)

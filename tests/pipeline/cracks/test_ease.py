@@ -81,6 +81,23 @@ def test_what_moves_on_takes_its_way_along(glass: Carry) -> None:
     assert float((first - start).norm(dim=1).max()) < 0.05 * glass.matter.spacing[0]
 
 
+def test_what_flies_apart_is_drawn_as_it_is(bound: Carry) -> None:
+    """A film with few frames a second would show ragged faces for as long as they are seen."""
+    before, after = scene(bound, "crack")
+    spacing = bound.matter.spacing[0]
+    for far, at_once in ((0.5, False), (5.0, True)):
+        flown = after._replace(position=after.position + apart(bound, far * spacing))
+        history = Repair().begin(bound)
+        drawn(bound, history, before)
+        film = [drawn(bound, history, flown)]
+        assert ("easing" in history.state()) != at_once
+        while "easing" in history.state():
+            film.append(drawn(bound, history, flown))
+        assert len(film) == (1 if at_once else 3)
+        alone = drawn(bound, Repair().begin(bound), flown)
+        assert torch.equal(film[-1].ids, alone.ids)
+
+
 def test_a_run_is_taken_up_on_the_way(bound: Carry) -> None:
     before, after = scene(bound, "crack")
     history = Repair().begin(bound)
