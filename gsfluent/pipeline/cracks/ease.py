@@ -22,7 +22,7 @@ from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 FRAMES = 8
 """Frames in which the picture of a split comes to be where its faces stand still; the first shows
 nothing of it."""
-PARTS = 2.0
+PARTS = 1.0
 """Way [spacings] that faces part in which it comes to be in any case: what flies apart is not seen
 to change, and must not be dragged along."""
 FAR = 1.5

@@ -93,7 +93,7 @@ def test_what_flies_apart_is_drawn_as_it_is(bound: Carry) -> None:
         assert ("easing" in history.state()) != at_once
         while "easing" in history.state():
             film.append(drawn(bound, history, flown))
-        assert len(film) == (1 if at_once else 3)
+        assert len(film) == (1 if at_once else 2)
         alone = drawn(bound, Repair().begin(bound), flown)
         assert torch.equal(film[-1].ids, alone.ids)
 
