@@ -32,7 +32,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_in_part, in_turns
 from gsfluent.pipeline.cracks.dust import Dust
-from gsfluent.pipeline.cracks.ease import PARTS
+from gsfluent.pipeline.cracks.ease import PARTS, SNAPS
 from gsfluent.pipeline.cracks.followers import (
     WIDE,
     Followers,
@@ -202,7 +202,7 @@ class Chunks:
         """
         count = self._chunk.shape[0]
         unit = points.unit if points.unit is not None else points.fragments.long()
-        unit, unsplit, parting = unit[:count], None, PARTS
+        unit, unsplit, parting = unit[:count], None, 1.0
         if self._unit is None or not torch.equal(unit, self._unit):
             self._unit = unit
             before, splits, unsplit = self._chunk, len(self._events), self._twin()
@@ -211,11 +211,12 @@ class Chunks:
                 self._relink()
             if len(self._events) > splits and self._last is not None:
                 chunks = before, self._chunk
-                parting = parted(self.base.links, chunks, points.position, self._last)
+                far = torch.where(self._stiff, SNAPS, PARTS)
+                parting = parted(self.base.links, chunks, points.position, self._last, far)
         self._steps += 1
         self._last = points.position[:count].clone()
         cracks = self._cracks(points)
-        if unsplit is None or not parting < PARTS:
+        if unsplit is None or not parting < 1.0:
             return cracks
         return cracks._replace(unsplit=unsplit._cracks(points), parting=parting)
 

@@ -22,11 +22,12 @@ from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 FRAMES = 8
 """Frames in which the picture of a split comes to be where its faces stand still; the first shows
 nothing of it."""
-PARTS = 1.0
-"""Way [spacings] that faces part in which it comes to be in any case: what flies apart is not seen
-to change, and must not be dragged along."""
+PARTS, SNAPS = 2.0, 0.25
+"""Way [spacings] that new faces part in which it comes to be in any case, of what bends and of what
+is stiff: what flies apart is not seen to change and must not be dragged along, and glass snaps."""
 FAR = 1.5
-"""Splats do not cross a crack that is wider than this [spacings]: they go here and come there."""
+"""Splats that change sides do not cross a crack that is wider than this [spacings]: they go here
+and come there."""
 _SAME = 1e-3  # of a spacing, or of a map: below it nothing has changed
 _WHOLE = 1.0 - 1e-6  # a sum of paces
 _ALIKE = 0.02  # of a spacing, of the shape, of opacities: below it nobody sees a change
@@ -40,6 +41,7 @@ class Easing(NamedTuple):
         done: Part of the way that is done, [K].
         pace: Part that is done in a frame, [K].
         anchor: Point that each of them goes with, int64 [K].
+        jumps: Which of them change sides across a wide crack, bool [K].
         before: How they were drawn, in coordinates of the matter at their point, [K].
         coming: Those that were not there, ascending, int64 [J].
         there: Part of the way that is done, [J].
@@ -50,6 +52,7 @@ class Easing(NamedTuple):
     done: Tensor
     pace: Tensor
     anchor: Tensor
+    jumps: Tensor
     before: Gaussians
     coming: Tensor
     there: Tensor
@@ -63,7 +66,8 @@ class Easing(NamedTuple):
             return None
         return Easing(
             self.ids[keep], done[keep], self.pace[keep], self.anchor[keep],
-            self.before.select(keep), self.coming[new], there[new], self.haste[new],
+            self.jumps[keep], self.before.select(keep),
+            self.coming[new], there[new], self.haste[new],
         )  # fmt: skip
 
     def state(self) -> dict[str, Any]:
@@ -93,8 +97,7 @@ class Easing(NamedTuple):
         old = _placed(self.before, self.anchor, carry, points)
         rows, k = _matches(drawn.ids, self.ids)
         if rows.numel():
-            edge = carry.links.spacing[drawn.anchor[rows]]
-            splats = _between(splats, rows, old.select(k), share[k], FAR * edge)
+            splats = _between(splats, rows, old.select(k), share[k], self.jumps[k])
         rows, k = _matches(drawn.ids, self.coming)
         there = (2.0 * self.there[k].to(splats.means)).clamp(max=1.0)
         opacity = splats.opacities.index_copy(0, rows, splats.opacities[rows] * there)
@@ -138,24 +141,27 @@ def begun(before: Cracks, after: Cracks, easing: Easing | None) -> Easing:
     lone = lone.nonzero()[:, 0]
     which = torch.cat([first[moved], lone])
     anchor = torch.cat([new.anchor[second[moved]], old.anchor[lone]])
+    way = old.gaussians.means[first] - new.gaussians.means[second]
+    jumps = (way.norm(dim=1) > FAR * edge) & (old.anchor[first] != new.anchor[second])
+    jumps = torch.cat([jumps[moved], torch.zeros_like(lone, dtype=torch.bool)])
     was = old.gaussians.select(which)
     was = was.replace(sh=was.sh[:, :1])
     held = _held(was, anchor, after.carry, after.points)
     ids, coming = old.ids[which], new.ids[~torch.isin(new.ids, old.ids)]
-    begin = after.parting / PARTS
+    begin = after.parting
     step = begin + 1.0 / FRAMES
     each = [was.means.new_full((len(n),), v) for n in (ids, coming) for v in (begin, step)]
     done, pace, there, haste = each
     if easing is not None:
         go_on = ~torch.isin(easing.ids, torch.cat([old.ids, new.ids]))
-        ids, done, pace, anchor = (
+        ids, done, pace, anchor, jumps = (
             torch.cat([mine, theirs[go_on]])
-            for mine, theirs in zip((ids, done, pace, anchor), easing[:4], strict=True)
+            for mine, theirs in zip((ids, done, pace, anchor, jumps), easing[:5], strict=True)
         )
         held = Gaussians.cat([held, easing.before.select(go_on)])
     order, sort = ids.argsort(), coming.argsort()
     return Easing(
-        ids[order], done[order], pace[order], anchor[order], held.select(order),
+        ids[order], done[order], pace[order], anchor[order], jumps[order], held.select(order),
         coming[sort], there[sort], haste[sort],
     )  # fmt: skip
 
@@ -233,7 +239,7 @@ def _turned(splats: Gaussians, turn: Tensor, means: Tensor) -> Gaussians:
 
 
 def _between(
-    splats: Gaussians, rows: Tensor, old: Gaussians, share: Tensor, far: Tensor
+    splats: Gaussians, rows: Tensor, old: Gaussians, share: Tensor, jumps: Tensor
 ) -> Gaussians:
     """Some splats part of the way from how they were drawn.
 
@@ -242,10 +248,9 @@ def _between(
         rows: Which are on the way, int64 [R].
         old: How these were, [R].
         share: Part of the way that is done, [R].
-        far: Way from which on they go and come rather than move [m], [R].
+        jumps: Which go and come rather than move, bool [R].
     """
     new = splats.select(rows)
-    jumps = (old.means - new.means).norm(dim=1) > far
     done = torch.where(jumps, (share >= 0.5).to(share), share)[:, None]
     quats, scales = ops.covariance_axes(torch.lerp(old.covariances(), new.covariances(), done))
     opacity = torch.lerp(old.opacities, new.opacities, done[:, 0])

@@ -93,14 +93,17 @@ def neighbours(links: Links, chunk: Tensor, rows: Tensor, among: Tensor) -> tupl
     return near, lone
 
 
-def parted(links: Links, chunks: tuple[Tensor, Tensor], position: Tensor, last: Tensor) -> float:
-    """How far neighbours that no longer go together went apart in a frame [spacings], half of them.
+def parted(
+    links: Links, chunks: tuple[Tensor, Tensor], position: Tensor, last: Tensor, far: Tensor
+) -> float:
+    """How far neighbours that no longer go together went apart in a frame, half of them.
 
     Args:
         links: Of all points at rest.
         chunks: What each went with before, and now, int64 [N].
         position: Where they are [m], [N', 3].
         last: Where they were [m], [N, 3].
+        far: Way that counts as one [spacings], [N].
     """
     near = links.near
     together, parts = (chunk[near] == chunk[:, None] for chunk in chunks)
@@ -108,7 +111,8 @@ def parted(links: Links, chunks: tuple[Tensor, Tensor], position: Tensor, last: 
     if row.numel() == 0:
         return 0.0
     way = position[: len(last)] - last
-    return float(((way[row] - way[near[row, column]]).norm(dim=1) / links.spacing[row]).median())
+    apart = (way[row] - way[near[row, column]]).norm(dim=1)
+    return float((apart / (far * links.spacing)[row]).median())
 
 
 class Lent(NamedTuple):

@@ -84,7 +84,8 @@ class Cracks(NamedTuple):
             that is [m], [L, 3]; None where there are none.
         unsplit: This moment as it would be without the splits of it; None where there are none, or
             their faces part too fast for anybody to see the difference.
-        parting: How far these have parted since the last moment [spacings].
+        parting: How much of the way from there to here is done as these have parted since the last
+            moment, 0 to 1.
         ease: What puts splats on their way that were drawn otherwise before splits; None where
             there are none.
     """
