@@ -22,7 +22,7 @@ from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
 FRAMES = 8
 """Frames in which the picture of a split comes to be where its faces stand still; the first shows
 nothing of it."""
-PARTS, SNAPS = 2.0, 0.25
+PARTS, SNAPS = 1.0, 0.25
 """Way [spacings] that new faces part in which it comes to be in any case, of what bends and of what
 is stiff: what flies apart is not seen to change and must not be dragged along, and glass snaps."""
 FAR = 1.5
