@@ -18,6 +18,7 @@ from gsfluent import geometry, ops
 from gsfluent.data import Gaussians
 from gsfluent.pipeline.cracks.gaps import Cracks, Drawn
 from gsfluent.pipeline.matter.carry import STRETCH, Carry, Points
+from gsfluent.results.frames import DUST
 
 FRAMES = 8
 """Frames in which the picture of a split comes to be where its faces stand still; the first shows
@@ -189,13 +190,15 @@ def _touched(before: Cracks, after: Cracks) -> Tensor:
 
 
 def _drawn(cracks: Cracks, rows: Tensor) -> Drawn:
-    """Some of the bound splats, and all births, as they are drawn."""
+    """Some of the bound splats, and all births but dust, as they are drawn."""
     carry, rest = copy.copy(cracks.carry), cracks.rest.select(rows)
     carry.owner = carry.owner[rows]
     splats = carry.apply(carry.follow(cracks.points, rest), rest)
     parts = [Drawn(splats, rows, carry.owner)]
     if cracks.births is not None:
-        parts.append(Drawn(*cracks.births))
+        stays = cracks.births.ids < DUST  # dust comes by degrees of its own
+        born, *names = cracks.births
+        parts.append(Drawn(born.select(stays), *(name[stays] for name in names)))
     gaussians = Gaussians.cat([part.gaussians for part in parts])
     ids, anchor = (torch.cat(values) for values in zip(*(p[1:] for p in parts), strict=True))
     return Drawn(gaussians, ids, anchor)

@@ -98,6 +98,8 @@ def parted(
 ) -> float:
     """How far neighbours that no longer go together went apart in a frame, half of them.
 
+    Where only dust has left, all the way: that leaves by degrees of its own.
+
     Args:
         links: Of all points at rest.
         chunks: What each went with before, and now, int64 [N].
@@ -109,7 +111,7 @@ def parted(
     together, parts = (chunk[near] == chunk[:, None] for chunk in chunks)
     row, column = (together & ~parts).nonzero().unbind(dim=1)
     if row.numel() == 0:
-        return 0.0
+        return 1.0
     way = position[: len(last)] - last
     apart = (way[row] - way[near[row, column]]).norm(dim=1)
     return float((apart / (far * links.spacing)[row]).median())
