@@ -303,10 +303,13 @@ def every_camera(out: Path) -> Iterator[str]:
     worst: dict[tuple[int, str], float] = {}
     for index in range(len(film)):
         frame = film.frame(index)
-        shown = {"raw": (raw.at(frame), None), "drawn": (frame.gaussians, frame.groups)}
+        shown = {
+            "raw": Drawn(raw.at(frame), None, frame.positions),
+            "drawn": Drawn(frame.gaussians, frame.groups, frame.shown),
+        }
         for number, camera in enumerate([small(film.cameras[index]), *film.around]):
-            matter = MatterView.of(frame.positions, frame.volumes, camera)
             for name, drawn in shown.items():
+                matter = MatterView.of(drawn.shown, frame.volumes, camera)
                 seen = picture(drawn, camera)
                 found = Holes.of(seen.alpha, cast(Tensor, seen.depth), matter).fraction
                 worst[number, name] = max(worst.get((number, name), 0.0), found)

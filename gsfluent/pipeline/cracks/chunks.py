@@ -32,6 +32,7 @@ from gsfluent.pipeline.cracks.chunk_faces import (
 )
 from gsfluent.pipeline.cracks.cuts import cut_in_part
 from gsfluent.pipeline.cracks.dust import Dust
+from gsfluent.pipeline.cracks.ease import PARTS, SNAPS
 from gsfluent.pipeline.cracks.followers import (
     WIDE,
     Followers,
@@ -40,6 +41,7 @@ from gsfluent.pipeline.cracks.followers import (
     held,
     motions,
     neighbours,
+    parted,
     stiff,
 )
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
@@ -117,6 +119,7 @@ class Chunks:
         self._follow: Followers | None = None
         self._unbroken: Followers | None = None
         self._unit: Tensor | None = None
+        self._last: Tensor | None = None
         self._faces: ChunkFaces | None = None
         self._cuts: list[ChunkCuts] = []
         self._region = self.base.body.clone()
@@ -138,6 +141,9 @@ class Chunks:
         self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
+            self._drives[state["idle"].to(device)] = False
+            last = state["last"]
+            self._last = None if last is None else last.to(device)
             if "dust" in state:
                 self._dust.resume(state["dust"])
             self._relink()
@@ -154,6 +160,8 @@ class Chunks:
                 for event in self._events
             ],
             "crumbs": self._crumb.nonzero()[:, 0].cpu(),
+            "idle": (~self._drives).nonzero()[:, 0].cpu(),
+            "last": None if self._last is None else self._last.cpu(),
             "gaps": self._gaps.state(),
             "dust": self._dust.state(),
             "steps": self._steps,
@@ -194,14 +202,33 @@ class Chunks:
         """
         count = self._chunk.shape[0]
         unit = points.unit if points.unit is not None else points.fragments.long()
-        unit = unit[:count]
+        unit, unsplit, parting = unit[:count], None, 1.0
         if self._unit is None or not torch.equal(unit, self._unit):
             self._unit = unit
-            before = self._chunk
+            before, splits, unsplit = self._chunk, len(self._events), self._twin()
             self._look(unit)
             if self._chunk is not before:
                 self._relink()
+            if len(self._events) > splits and self._last is not None:
+                chunks = before, self._chunk
+                far = torch.where(self._stiff, SNAPS, PARTS)
+                parting = parted(self.base.links, chunks, points.position, self._last, far)
         self._steps += 1
+        self._last = points.position[:count].clone()
+        cracks = self._cracks(points)
+        if unsplit is None or not parting < 1.0:
+            return cracks
+        return cracks._replace(unsplit=unsplit._cracks(points), parting=parting)
+
+    def _twin(self) -> Chunks:
+        """The same, to go on from here in another way."""
+        other = copy.copy(self)
+        other._cuts, other._events = list(self._cuts), list(self._events)
+        other._gaps, other._dust = self._gaps.twin(), self._dust.twin()
+        return other
+
+    def _cracks(self, points: Points) -> Cracks:
+        """The cracks of a frame, as regions are now."""
         shown, carry = self._moved(points), self._carry(points)
         self._dust.step(points.position, shown.position)
         self._gaps.rebind(carry)

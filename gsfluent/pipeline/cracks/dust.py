@@ -14,6 +14,7 @@ same in every frame, on every device and after a resume. A run without dust has 
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable
@@ -103,6 +104,12 @@ class Dust:
         # of every point: the way that it has gone from its chunk, and where it was
         self._way = self.edge.new_zeros((len(self.edge), 3))
         self._last = self.edge.new_full((len(self.edge), 3), torch.nan)
+
+    def twin(self) -> Dust:
+        """The same, to go on from here in another way."""
+        other = copy.copy(self)
+        other._grains = list(self._grains)
+        return other
 
     def resume(self, state: dict[str, Any]) -> None:
         """Go on from :meth:`state`, when all that is dust has been added again."""

@@ -93,6 +93,30 @@ def neighbours(links: Links, chunk: Tensor, rows: Tensor, among: Tensor) -> tupl
     return near, lone
 
 
+def parted(
+    links: Links, chunks: tuple[Tensor, Tensor], position: Tensor, last: Tensor, far: Tensor
+) -> float:
+    """How far neighbours that no longer go together went apart in a frame, half of them.
+
+    Where only dust has left, all the way: that leaves by degrees of its own.
+
+    Args:
+        links: Of all points at rest.
+        chunks: What each went with before, and now, int64 [N].
+        position: Where they are [m], [N', 3].
+        last: Where they were [m], [N, 3].
+        far: Way that counts as one [spacings], [N].
+    """
+    near = links.near
+    together, parts = (chunk[near] == chunk[:, None] for chunk in chunks)
+    row, column = (together & ~parts).nonzero().unbind(dim=1)
+    if row.numel() == 0:
+        return 1.0
+    way = position[: len(last)] - last
+    apart = (way[row] - way[near[row, column]]).norm(dim=1)
+    return float((apart / (far * links.spacing)[row]).median())
+
+
 class Lent(NamedTuple):
     """Points whose matter is drawn with another chunk than theirs.
 

@@ -7,8 +7,9 @@ little of it changes from one frame to the next. It is part of a saved run (:met
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -55,6 +56,20 @@ class Births(NamedTuple):
         return cls(gaussians, ids, anchor)
 
 
+class Drawn(NamedTuple):
+    """Splats of one moment.
+
+    Attributes:
+        gaussians: In scene coordinates, [M].
+        ids: Number of each, none twice, int64 [M].
+        anchor: Material point that each follows, int64 [M].
+    """
+
+    gaussians: Gaussians
+    ids: Tensor
+    anchor: Tensor
+
+
 class Cracks(NamedTuple):
     """The cracks of one moment.
 
@@ -66,6 +81,12 @@ class Cracks(NamedTuple):
         dust: Material points that are drawn as dust, int64 [D]; None where there are none.
         lent: Points whose matter is drawn with another piece than theirs, int64 [L], and where
             that is [m], [L, 3]; None where there are none.
+        unsplit: This moment as it would be without the splits of it; None where there are none, or
+            their faces part too fast for anybody to see the difference.
+        parting: How much of the way from there to here is done as these have parted since the last
+            moment, 0 to 1.
+        ease: What puts splats on their way that were drawn otherwise before splits; None where
+            there are none.
     """
 
     points: Points
@@ -74,6 +95,9 @@ class Cracks(NamedTuple):
     carry: Carry
     dust: Tensor | None = None
     lent: tuple[Tensor, Tensor] | None = None
+    unsplit: Cracks | None = None
+    parting: float = 0.0
+    ease: Callable[[Drawn, Carry, Points], Drawn] | None = None
 
 
 class Gaps:
@@ -108,6 +132,12 @@ class Gaps:
     def state(self) -> dict[str, Any]:
         """What a later run needs to go on from here."""
         return {} if self._before is None else self._before.state()
+
+    def twin(self) -> Gaps:
+        """The same, to go on from here in another way."""
+        other = copy.copy(self)
+        other._stale = self._stale.clone()
+        return other
 
     def rebind(self, carry: Carry) -> None:
         """Go on with a binding of the same splats in which some points have other neighbours."""

@@ -22,7 +22,8 @@ from torch import Tensor
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.pipeline.cracks.chunks import Chunks
-from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
+from gsfluent.pipeline.cracks.ease import Easing, begun
+from gsfluent.pipeline.cracks.gaps import Cracks, Drawn, Gaps
 from gsfluent.pipeline.cracks.mvee import CROSS_RADIUS, NEIGHBOUR_RADIUS, CrackGraph, transitions
 from gsfluent.pipeline.liquid.parts import LiquidParts
 from gsfluent.pipeline.matter.carry import Carry, Motion, Points
@@ -134,7 +135,7 @@ class Repair(Stage):
             motion = cracks.carry.follow(cracks.points, cracks.rest)
         if cracks is not None:
             moved = cracks.carry.apply(motion, cracks.rest) if carried is None else carried
-            return _with_births(moved, motion, cracks.births)
+            return _with_births(moved, motion, cracks)
         moved = carry.apply(motion) if carried is None else carried
         if self.method == "none":
             return Repaired.none(moved, motion.anchor)
@@ -158,6 +159,7 @@ class CrackHistory:
     def __init__(self, repair: Repair, carry: Carry) -> None:
         self.repair, self.carry = repair, carry
         self._gaps: Chunks | Gaps | None = None
+        self._easing: Easing | None = None
         if repair.method in ("chunks", "gap"):
             self._gaps = Chunks(carry) if repair.method == "chunks" else Gaps(carry)
 
@@ -182,11 +184,21 @@ class CrackHistory:
         Returns:
             The cracks; None with the other methods.
         """
-        return None if self._gaps is None else self._gaps.step(points)
+        if self._gaps is None:
+            return None
+        cracks = self._gaps.step(points)
+        easing = None if self._easing is None else self._easing.older()
+        if cracks.unsplit is not None:
+            easing = begun(cracks.unsplit, cracks, easing)
+        self._easing = easing
+        return cracks._replace(unsplit=None, ease=None if easing is None else easing.apply)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs besides the points: plain tensors."""
-        return {} if self._gaps is None else self._gaps.state()
+        if self._gaps is None:
+            return {}
+        state = self._gaps.state()
+        return state if self._easing is None else state | {"easing": self._easing.state()}
 
     def partition(self) -> SavedPartition | None:
         """How the solids are split so far (``chunks``); None with the other methods."""
@@ -196,16 +208,21 @@ class CrackHistory:
         """Go on from :meth:`state`; from nothing for an empty one."""
         if self._gaps is not None:
             self._gaps.restore(state)
+        device = self.carry.gaussians.device
+        eased = state.get("easing")
+        self._easing = None if eased is None else Easing.restored(eased, device)
 
 
-def _with_births(moved: Gaussians, motion: Motion, births: Births | None) -> Repaired:
-    if births is None:
+def _with_births(moved: Gaussians, motion: Motion, cracks: Cracks) -> Repaired:
+    births = cracks.births
+    if births is None and cracks.ease is None:
         return Repaired.none(moved, motion.anchor)
-    rows = torch.arange(moved.count + births.ids.numel(), device=moved.device)
-    return Repaired(
-        Gaussians.cat([moved, births.gaussians]),
-        torch.full_like(rows, -1, dtype=torch.int32),
-        births.ids.numel(),
-        torch.cat([rows[: moved.count], births.ids]),
-        torch.cat([motion.anchor, births.anchor]),
-    )
+    rows = torch.arange(moved.count, device=moved.device)
+    drawn = Drawn(moved, rows, motion.anchor)
+    if births is not None:
+        pairs = zip(drawn[1:], births[1:], strict=True)
+        drawn = Drawn(Gaussians.cat([moved, births.gaussians]), *(torch.cat(p) for p in pairs))
+    if cracks.ease is not None:
+        drawn = cracks.ease(drawn, cracks.carry, motion.points)
+    groups = torch.full_like(drawn.ids, -1, dtype=torch.int32)
+    return Repaired(drawn.gaussians, groups, len(groups) - moved.count, drawn.ids, drawn.anchor)

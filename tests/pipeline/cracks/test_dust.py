@@ -218,6 +218,7 @@ def test_dust_does_not_pop(bound: Carry) -> None:
     found = []
     for far in (0.8, 1.2, 3.0, 3.0, 0.5):
         now = drawn(bound, history, thrown(bound, far * spacing)[0])
+        assert "easing" not in history.state()  # degrees of their own
         dust = now.ids >= DUST
         found.append((now.ids[dust], float(now.gaussians.opacities[dust].mean())))
     assert all(torch.equal(found[0][0], ids) for ids, _ in found)
