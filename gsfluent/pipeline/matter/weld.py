@@ -54,7 +54,7 @@ def crushed(matter: Matter, lowest: Tensor) -> Tensor:
     damage alpha *is* the plastic volume strain, it compacts only below its start, and the pressure
     there is at most ``p0(a) = kappa (1e-5 + sinh(xi |a|))``; so the work is at most the integral of
     ``p0`` from the lowest alpha ever seen to that of the start. That bound is what is asked: it
-    errs towards powder. Alpha is seen after every call of the engine, 64 steps or less apart.
+    errs towards powder. Alpha is seen after every call of the engine, 128 steps or less apart.
 
     Args:
         matter: The points.
