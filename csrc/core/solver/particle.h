@@ -270,30 +270,11 @@ GSF_HOST_DEVICE void viscous_particle(const SolverView<T>& s, int64_t p, const T
       shared_stress(out.stress, kirchhoff_stress(row[0], row[1], spring.d, spring.j2m1), share);
 }
 
-#ifdef __CUDACC__
-// In double, which is for comparisons, kernels call the laws: one copy for all of a file.
-template <typename T, bool kMore, bool kField>
-GSF_HOST_DEVICE_COLD ReturnMapped<T> called_law(const Sym3<T>& strain, T alpha,
-                                                const Mat3<T>& increment, int law,
-                                                const MaterialRow<T>& m, const NaccOptions<T>& o,
-                                                T dt) {
-  if constexpr (kMore)
-    return return_mapping_more(strain, alpha, increment, law, m, o, dt);
-  else
-    return return_mapping<kField>(strain, alpha, increment, law, m, o, dt);
-}
-#endif
-
 // The maps of the laws that a kernel is compiled for.
 template <typename T, int kLaws>
 GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const Mat3<T>& increment,
                                          int law, const MaterialRow<T>& m, const NaccOptions<T>& o,
                                          T dt) {
-#ifdef __CUDACC__
-  if constexpr (sizeof(T) == sizeof(double))
-    return called_law<T, kLaws == kMoreLaws, kLaws == kDamageField>(strain, alpha, increment, law,
-                                                                    m, o, dt);
-#endif
   if constexpr (kLaws == kMoreLaws)
     return return_mapping_more(strain, alpha, increment, law, m, o, dt);
   else
