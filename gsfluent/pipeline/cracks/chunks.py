@@ -141,8 +141,9 @@ class Chunks:
         self._steps = int(state.get("steps", 0))
         if state:
             self._crumb[state["crumbs"].to(device)] = True
-            self._drives[state["idle"].to(device)] = False
-            last = state["last"]
+            if "idle" in state:
+                self._drives[state["idle"].to(device)] = False
+            last = state.get("last")
             self._last = None if last is None else last.to(device)
             if "dust" in state:
                 self._dust.resume(state["dust"])

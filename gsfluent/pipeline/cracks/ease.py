@@ -27,8 +27,8 @@ PARTS, SNAPS = 1.0, 0.25
 """Way [spacings] that new faces part in which it comes to be in any case, of what bends and of what
 is stiff: what flies apart is not seen to change and must not be dragged along, and glass snaps."""
 FAR = 1.5
-"""Splats that change sides do not cross a crack that is wider than this [spacings]: they go here
-and come there."""
+"""Splats that change sides, or leave what is around them, do not cross what is wider than this
+[spacings]: they go here and come there."""
 _SAME = 1e-3  # of a spacing, or of a map: below it nothing has changed
 _WHOLE = 1.0 - 1e-6  # a sum of paces
 _ALIKE = 0.02  # of a spacing, of the shape, of opacities: below it nobody sees a change
@@ -42,7 +42,7 @@ class Easing(NamedTuple):
         done: Part of the way that is done, [K].
         pace: Part that is done in a frame, [K].
         anchor: Point that each of them goes with, int64 [K].
-        jumps: Which of them change sides across a wide crack, bool [K].
+        jumps: Which of them go here and come there, bool [K].
         before: How they were drawn, in coordinates of the matter at their point, [K].
         coming: Those that were not there, ascending, int64 [J].
         there: Part of the way that is done, [J].
@@ -143,7 +143,8 @@ def begun(before: Cracks, after: Cracks, easing: Easing | None) -> Easing:
     which = torch.cat([first[moved], lone])
     anchor = torch.cat([new.anchor[second[moved]], old.anchor[lone]])
     way = old.gaussians.means[first] - new.gaussians.means[second]
-    jumps = (way.norm(dim=1) > FAR * edge) & (old.anchor[first] != new.anchor[second])
+    jumps = way.norm(dim=1) > FAR * edge
+    jumps &= (old.anchor[first] != new.anchor[second]) | _alone(before, after)[new.anchor[second]]
     jumps = torch.cat([jumps[moved], torch.zeros_like(lone, dtype=torch.bool)])
     was = old.gaussians.select(which)
     was = was.replace(sh=was.sh[:, :1])
@@ -187,6 +188,15 @@ def _touched(before: Cracks, after: Cracks) -> Tensor:
         if a is not b:
             rows = rows | (a != b).view(len(rows), -1).any(dim=1)
     return rows
+
+
+def _alone(before: Cracks, after: Cracks) -> Tensor:
+    """Points that are shown elsewhere than before and leave those around them, bool [N]."""
+    links = after.carry.links
+    count = links.near.shape[0]
+    way = after.points.position[:count] - before.points.position[:count]
+    around = way[links.near].median(dim=1).values
+    return (way - around).norm(dim=1) > 0.5 * FAR * links.spacing
 
 
 def _drawn(cracks: Cracks, rows: Tensor) -> Drawn:
