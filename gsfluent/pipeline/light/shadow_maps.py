@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from gsfluent import geometry, ops
 from gsfluent.data import SPRAY, Gaussians
@@ -135,7 +136,9 @@ def shadow_maps(
         near=_NEAR,
     )
     assert seen.depth is not None  # asked for
-    return ShadowMaps(seen.depth, seen.alpha, cameras)
+    # Looked up beyond a map is its border: a grain that flew there would shade all behind it.
+    alpha = functional.pad(seen.alpha[:, 1:-1, 1:-1], (1, 1, 1, 1))
+    return ShadowMaps(seen.depth, alpha, cameras)
 
 
 def _row(view: Tensor, focal: float, near: float, bias: float, size: int) -> Tensor:

@@ -27,9 +27,6 @@ TAKE_OFF = 4.0
 VIBRATION = 0.01
 """Largest share of a piece's kinetic energy that may lie in vibration (kinetic and elastic) when it
 takes off."""
-OPENING = 1e-4
-"""The same in a body that broke, of kinetic energy alone: strains that its cracks have left balance
-each other and fly along, but a crack that still opens must not be held."""
 CALM_FRAMES = 3
 """Frames in a row at rest before a group sleeps."""
 CALM = 0.02
@@ -193,14 +190,11 @@ class Leaving:
         """Let a piece fly if it is rigid enough and has room for half a frame."""
         matter, p = self.matter, state.particles
         points = p.select(rows)
+        density = matter.stored(points, state.peak[rows])
+        stored = (density.double() * points.volume.double()).sum()
         moving = kinetic_energy(points.mass, points.velocity, points.affine, matter.dx)
-        if bool(state.ever[rows].any()):
-            stored, most = 0.0 * moving, OPENING
-        else:
-            density = matter.stored(points, state.peak[rows])
-            stored, most = (density.double() * points.volume.double()).sum(), VIBRATION
         # a rigid motion holds no more than all of it, and is not found for nothing
-        if not float(stored) <= 1.001 * most * float(moving):
+        if not float(stored) <= 1.001 * VIBRATION * float(moving):
             return state
         flight = Flight(
             points, state.position[rows], self.gravity, state.time, matter.dx, rigid=False
@@ -209,7 +203,7 @@ class Leaving:
         if time_to_meet(room, flight.speed_at(state.time), float(self.gravity.norm())) < frame / 2:
             return state
         lost = moving - flight.kinetic
-        if not float(lost + stored) <= most * flight.kinetic:
+        if not float(lost + stored) <= VIBRATION * flight.kinetic:
             return state
         moved, place = flight.state_at(state.time)
         self.flights += 1

@@ -141,6 +141,23 @@ def test_grains_of_a_spray_shade_nothing(skin: Gaussians) -> None:
     assert torch.equal(both.alpha, alone.alpha) and not torch.equal(shading.alpha, alone.alpha)
 
 
+def test_what_flew_onto_the_border_of_a_map_shades_nothing_beyond(skin: Gaussians) -> None:
+    lamps, matter = (Lamp(direction=(0.0, 0.0, 1.0)),), bulk(skin)
+    wide = 8.0 * matter.radius
+    sheet = skin.select(torch.arange(1)).replace(
+        means=torch.tensor([[*matter.center[:2], matter.center[2] + 0.5 * matter.radius]]),
+        scales=torch.tensor([[wide, wide, 1e-3]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        opacities=torch.ones(1),
+    )
+    maps = shadow_maps(Gaussians.cat([skin, sheet]), lamps, (1,), 128, matter)
+    assert maps is not None
+    opaque = maps.alpha[0] > 0.9
+    assert opaque[1:-1, 1:-1].all()
+    opaque[1:-1, 1:-1] = False
+    assert not opaque.any()
+
+
 def test_haze_before_a_skin_is_no_matter(skin: Gaussians) -> None:
     # a skin that is divided, or one from photographs: many splats, each of which hides little
     haze = skin.replace(means=1.2 * skin.means, opacities=torch.full_like(skin.opacities, 0.1))

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.ops.reference import plasticity
-from gsfluent.pipeline.simulate.groups import Leaving
 from gsfluent.pipeline.simulate.stage import Simulate, SimulationFrame
 from gsfluent.scene.scene import Scene
 
@@ -170,28 +169,6 @@ def test_pieces_that_touch_nothing_any_more_fly_again() -> None:
     assert 0 < on.report["substeps"] < off.report["substeps"]
     assert on.report["contact_nodes"] == off.report["contact_nodes"] == 0
     assert_same(on, off, place=0.02, energy=5e-3, momentum=2e-3)
-
-
-def test_strains_that_cracks_left_do_not_keep_a_piece_on_the_grid() -> None:
-    """They balance each other and fly along; in what never broke they are a vibration."""
-    steps = Simulate(dx=DX, splats=False)(tossed(), fps=20, seconds=0.05)
-    next(steps)
-    run, state = steps.run, steps.run.state
-    broke = state.particles.body == 0
-    state = state._replace(
-        landed=(True, True), ever=broke,
-        particles=state.particles.replace(strain=torch.full_like(state.particles.strain, 0.3)),
-    )  # fmt: skip
-    leaving = Leaving(
-        run.matter, run.stepper.rigid, torch.tensor([0.0, 0.0, -9.81]), sleep=False, fly=True
-    )
-    left = leaving(state, state.unit, 0.05)
-    assert torch.equal(left.group >= 0, broke) and leaving.flights == 1
-    assert torch.equal(left.particles.strain, state.particles.strain)
-    shaken = state.particles.velocity.clone()
-    shaken[::2] += 1.0
-    shaking = state._replace(particles=state.particles.replace(velocity=shaken))
-    assert not (leaving(shaking, state.unit, 0.05).group >= 0).any()
 
 
 # --- rest ---
