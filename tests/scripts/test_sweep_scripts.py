@@ -45,15 +45,19 @@ def test_packed_shots_are_those_one_after_another(tmp_path: Path) -> None:
         for sweep in sweeps
     )
     assert one == four and len(set(one)) == 2
+    spent = {
+        "until_all": 1.0, "first_shot": 2.0, "later_shot": None, "after_last": 0.5,
+        "busy_cores": 1.5,
+    }  # fmt: skip
     row = {
         "device": "D", "cores": 2, "shots": 2, "pack": 2, "points": 1000, "seconds_of_film": 0.1,
-        "one_after_another": 8.0, "packed": 2.0, "peak_device_memory_bytes": 2e9,
-        "same_figures": True,
+        "one_after_another": {**spent, "wall": 8.0}, "packed": {**spent, "wall": 2.0},
+        "peak_device_memory_bytes": 2e9, "same_figures": True,
     }  # fmt: skip
     assert "4.00 times as fast" in packing.markdown(row)
     rows = [
         {"device": "GPU", "cores": 32, "gpus": n, "shots": 64, "pack": 8, "wall": 100.0 / n,
-         "same_figures": True}
+         "same_figures": True, **spent}
         for n in (1, 2)
     ]  # fmt: skip
-    assert "| 2 | 50.0 | 0.78 | 2.00 | yes |" in packing.table(rows)
+    assert "| 2 | 50.0 | 0.78 | 2.00 | 1.0 | 2.0 |  | 0.5 | 1.5 | yes |" in packing.table(rows)
