@@ -25,6 +25,7 @@ from gsfluent.data import Frame, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.geometry import quaternion_to_matrix
 from gsfluent.io import kind_of, load_splats
+from gsfluent.io.splats import forge
 from gsfluent.io.splats.load import FORGED, save_forged
 from gsfluent.io.splats.splat import save_splat
 from gsfluent.io.splats.spz import save_spz
@@ -266,3 +267,13 @@ def test_a_spz_that_grows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyP
     (tmp_path / "a.spz").write_bytes(stream.getvalue())
     with pytest.raises(InputError, match="above the limit"):
         load_splats(tmp_path / "a.spz")
+
+
+def test_a_conversion_that_never_ends_is_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("gaussforge", reason="the extra formats is not installed")
+    monkeypatch.setattr(forge, "PATIENCE", 0.2)
+    monkeypatch.setattr(forge, "_CONVERT", "import time\ntime.sleep(60)")
+    with pytest.raises(InputError, match="has worked on it for 0"):
+        forge.converted(b"", "ply", "sog", tmp_path / "slow.sog")

@@ -13,6 +13,9 @@ from pathlib import Path
 
 from gsfluent.errors import InputError, need
 
+PATIENCE = 600
+"""Seconds that a conversion may take: a hostile file must not hang a run."""
+
 _CONVERT = """
 import sys, gaussforge
 made = gaussforge.GaussForge().convert(sys.stdin.buffer.read(), *sys.argv[1:3])
@@ -38,10 +41,15 @@ def converted(data: bytes, kind: str, wanted: str, path: str | Path) -> bytes:
     need("gaussforge", "formats", f"{path}: its format")
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "made"
-        done = subprocess.run(
-            [sys.executable, "-c", _CONVERT, kind, wanted, str(made)],
-            input=data, capture_output=True,
-        )  # fmt: skip
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _CONVERT, kind, wanted, str(made)],
+                input=data, capture_output=True, timeout=PATIENCE,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            raise InputError(
+                f"{path}: gaussforge has worked on it for {PATIENCE} s", "use a .ply instead"
+            ) from None
         if done.returncode != 0:
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["it crashed"]
             raise InputError(
