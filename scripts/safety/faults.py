@@ -25,6 +25,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import torch
+
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "faults"))
 
@@ -283,6 +285,7 @@ def main() -> int:
     parser.add_argument("--cost", action="store_true", help="measure what digests cost, only")
     parser.add_argument("--enter", action="store_true", help="write the table into docs/measured")
     options = parser.parse_args()
+    torch.set_num_threads(1)  # what is forked after OpenMP has threads waits for them for ever
     start = time.monotonic()
     with (
         tempfile.TemporaryDirectory() as folder,
