@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 from gsfluent.data import Gaussians, Solid
-from gsfluent.pipeline.cracks.cuts import REACH
+from gsfluent.ops.reference.deform import CUT_REACH
 from gsfluent.pipeline.cracks.sites import matter_colors, skin_colors_at
 from gsfluent.pipeline.partition.splits import Split, Splits
 from gsfluent.pipeline.partition.tree import Partition
@@ -305,7 +305,7 @@ def find_cuts(
     root = geometry.quaternion_to_matrix(splats.quats[rows[found]])
     root = root * splats.scales[rows[found], None]
     sigma = (normal[:, None] @ root)[:, 0].norm(dim=1)
-    cut = (second >= 0) & (distance < REACH * sigma)
+    cut = (second >= 0) & (distance < CUT_REACH * sigma)
     beyond = splits.region(of[cut], second[cut])
     return region, ChunkCuts(
         rows[found[cut]], beyond, normal[cut], distance[cut], torch.full_like(beyond, -1)
@@ -329,7 +329,7 @@ def wide_cuts(
         cell: Cell of the search [m].
     """
     known = torch.isin(rows, cuts.splat) | ~torch.isin(region, faces.region)
-    reach = REACH * splats.scales[rows].amax(dim=1) / cell
+    reach = CUT_REACH * splats.scales[rows].amax(dim=1) / cell
     octave = torch.where(known, 0.0, torch.log2(reach.clamp(min=1.0)).ceil())
     found = [cuts]
     for number in torch.unique(octave[octave > 0]).tolist():
@@ -341,7 +341,9 @@ def wide_cuts(
         element, distance = near[:, 0].clamp(min=0), way[:, 0].to(means)
         normal = (faces.means[element] - means) / distance.clamp(min=1e-12)[:, None]
         root = geometry.quaternion_to_matrix(splats.quats[mine]) * splats.scales[mine, None]
-        across = (distance > 0.0) & (distance < REACH * (normal[:, None] @ root)[:, 0].norm(dim=1))
+        across = (distance > 0.0) & (
+            distance < CUT_REACH * (normal[:, None] @ root)[:, 0].norm(dim=1)
+        )
         beyond = faces.beyond[element]
         parts = (mine, beyond, normal, distance, torch.full_like(beyond, -1))
         found.append(ChunkCuts(*(part[across] for part in parts)))

@@ -7,9 +7,6 @@ from torch import Tensor
 
 from gsfluent import geometry, ops
 
-REACH = 2.0
-"""Faces further than this many standard deviations from a centre leave the splat alone."""
-
 
 def cut_in_part(
     splats: tuple[Tensor, Tensor, Tensor], whole: Tensor, rows: Tensor, normal: Tensor,

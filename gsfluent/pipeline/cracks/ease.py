@@ -109,11 +109,9 @@ class Easing(NamedTuple):
         last = old.select(gone)
         there = (1.5 * (1.0 - share[gone])).clamp(max=1.0).square()
         last = last.replace(opacities=last.opacities * there)
-        return Drawn(
-            Gaussians.cat([drawn.gaussians, last]),
-            torch.cat([drawn.ids, self.ids[gone]]),
-            torch.cat([drawn.anchor, self.anchor[gone]]),
-        )
+        whole = Drawn.joined([drawn, Drawn(last, self.ids[gone], self.anchor[gone])])
+        assert whole is not None  # both are there
+        return whole
 
 
 def begun(before: Cracks, after: Cracks, easing: Easing | None) -> Easing:
@@ -209,9 +207,9 @@ def _drawn(cracks: Cracks, rows: Tensor) -> Drawn:
         stays = cracks.births.ids < DUST  # dust comes by degrees of its own
         born, *names = cracks.births
         parts.append(Drawn(born.select(stays), *(name[stays] for name in names)))
-    gaussians = Gaussians.cat([part.gaussians for part in parts])
-    ids, anchor = (torch.cat(values) for values in zip(*(p[1:] for p in parts), strict=True))
-    return Drawn(gaussians, ids, anchor)
+    whole = Drawn.joined(parts)
+    assert whole is not None  # the first is there
+    return whole
 
 
 def _matches(ids: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -32,13 +32,14 @@ CHUNK = 100_000
 """Sites and splats that are looked at at once; bounds memory."""
 
 
-class Births(NamedTuple):
-    """Splats born on crack faces, at one moment.
+class Drawn(NamedTuple):
+    """Splats of one moment.
 
     Attributes:
-        gaussians: Label TRANSITION, with normals, [T].
-        ids: Number of each, the same as long as it lives and when it comes back, int64 [T].
-        anchor: Material point that each follows, int64 [T].
+        gaussians: In scene coordinates, [M].
+        ids: Number of each, none twice; the same as long as it lives and when it comes back, int64
+            [M].
+        anchor: Material point that each follows, int64 [M].
     """
 
     gaussians: Gaussians
@@ -46,7 +47,7 @@ class Births(NamedTuple):
     anchor: Tensor
 
     @classmethod
-    def joined(cls, parts: Sequence[Births | None]) -> Births | None:
+    def joined(cls, parts: Sequence[Self | None]) -> Self | None:
         """All of some, in their order; None where there are none."""
         some = [part for part in parts if part is not None]
         if len(some) < 2:
@@ -56,18 +57,8 @@ class Births(NamedTuple):
         return cls(gaussians, ids, anchor)
 
 
-class Drawn(NamedTuple):
-    """Splats of one moment.
-
-    Attributes:
-        gaussians: In scene coordinates, [M].
-        ids: Number of each, none twice, int64 [M].
-        anchor: Material point that each follows, int64 [M].
-    """
-
-    gaussians: Gaussians
-    ids: Tensor
-    anchor: Tensor
+class Births(Drawn):
+    """Splats born on crack faces: labels TRANSITION, with normals."""
 
 
 class Cracks(NamedTuple):

@@ -218,10 +218,8 @@ def _with_births(moved: Gaussians, motion: Motion, cracks: Cracks) -> Repaired:
     if births is None and cracks.ease is None:
         return Repaired.none(moved, motion.anchor)
     rows = torch.arange(moved.count, device=moved.device)
-    drawn = Drawn(moved, rows, motion.anchor)
-    if births is not None:
-        pairs = zip(drawn[1:], births[1:], strict=True)
-        drawn = Drawn(Gaussians.cat([moved, births.gaussians]), *(torch.cat(p) for p in pairs))
+    drawn = Drawn.joined([Drawn(moved, rows, motion.anchor), births])
+    assert drawn is not None  # the first is there
     if cracks.ease is not None:
         drawn = cracks.ease(drawn, cracks.carry, motion.points)
     groups = torch.full_like(drawn.ids, -1, dtype=torch.int32)
