@@ -26,12 +26,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsfluent.data import SURFACE, Gaussians, Solid
+from gsfluent.data import SURFACE, Gaussians, Particles, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit, Simulate
 from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.solve import Problem, linearise
+from gsfluent.pipeline.fit.stage import Found
 from gsfluent.pipeline.fit.task import RATIO, Task, one_by_one
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
@@ -138,10 +139,10 @@ def scene_of(kind: Kind, solid: Solid, values: dict[str, float], velocity: Any) 
     return scene
 
 
-def seen(
+def fall(
     kind: Kind, number: int, cells: int, random: np.random.Generator
-) -> tuple[Solid, np.ndarray, dict[str, float], np.ndarray, int]:
-    """A thing, its velocity and numbers, tracks of its fall, how many points moved."""
+) -> tuple[Solid, np.ndarray, dict[str, float], list[Particles]]:
+    """A thing, its velocity and numbers, its points at the frames of its fall."""
     solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
     velocity = np.array([*random.uniform(-0.3, 0.3, 2), random.uniform(-1.5, -0.5)])
     drawn = {name: random.uniform(*ends) for name, ends in kind.truth.items()}
@@ -150,9 +151,17 @@ def seen(
     run = Simulate(dx=dx, seed=100 + number, repair=False)(
         scene_of(kind, solid, true, velocity), fps=FPS, seconds=FRAMES / FPS
     )
-    frames = [frame.particles.position.double().numpy() for frame in run]
-    rows = random.choice(len(frames[0]), TRACKS, replace=False)
-    return solid, velocity, true, np.stack([frame[rows] for frame in frames]), len(frames[0])
+    return solid, velocity, true, [frame.particles for frame in run]
+
+
+def seen(
+    kind: Kind, number: int, cells: int, random: np.random.Generator
+) -> tuple[Solid, np.ndarray, dict[str, float], np.ndarray, int]:
+    """A thing, its velocity and numbers, tracks of its fall, how many points moved."""
+    solid, velocity, true, frames = fall(kind, number, cells, random)
+    places = [frame.position.double().numpy() for frame in frames]
+    rows = random.choice(len(places[0]), TRACKS, replace=False)
+    return solid, velocity, true, np.stack([place[rows] for place in places]), len(places[0])
 
 
 def keep(task: Task, found: dict[str, Any], path: Path) -> None:
@@ -172,6 +181,24 @@ def keep(task: Task, found: dict[str, Any], path: Path) -> None:
         scale=here.scale, frame=here.frame.astype(np.int16),
         covariance=np.asarray(found["covariance"]),
     )  # fmt: skip
+
+
+def errors_of(found: Found, true: dict[str, float], velocity: np.ndarray) -> list[dict[str, Any]]:
+    """What was found against the truth, a row for each number."""
+    errors = []
+    for key, learnt in found.report["parameters"].items():
+        name = key.partition(".")[2]
+        if name not in true and name != "velocity":
+            continue
+        for k, value in enumerate(np.ravel(learnt["value"])):
+            want = velocity[k] if name == "velocity" else true[name]
+            log = name not in ("velocity", *PLAIN)
+            error = math.log10(value / want) if log else float(value - want)
+            errors.append({"name": name, "error": error, "sd": float(np.ravel(learnt["sd"])[k]),
+                           "sd_noise": learnt["sd_noise"][k],
+                           "grid": learnt["grid"][k], "unidentified": key in found.unidentified,
+                           "truth": float(want)})  # fmt: skip
+    return errors
 
 
 def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict[str, Any]:
@@ -197,19 +224,7 @@ def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict
     end = clock.process_time()
     if kept is not None:
         keep(*searches[-1], kept / f"{kind}_{number}.npz")
-    errors = []
-    for key, learnt in found.report["parameters"].items():
-        name = key.partition(".")[2]
-        if name not in true and name != "velocity":
-            continue
-        for k, value in enumerate(np.ravel(learnt["value"])):
-            want = velocity[k] if name == "velocity" else true[name]
-            log = name not in ("velocity", *PLAIN)
-            error = math.log10(value / want) if log else float(value - want)
-            errors.append({"name": name, "error": error, "sd": float(np.ravel(learnt["sd"])[k]),
-                           "sd_noise": learnt["sd_noise"][k],
-                           "grid": learnt["grid"][k], "unidentified": key in found.unidentified,
-                           "truth": float(want)})  # fmt: skip
+    errors = errors_of(found, true, velocity)
     return {
         "kind": kind, "scene": number, "cells": cells, "rows": errors,
         "rms_mm": found.report["rms"] * 2**0.5, "truth_points": points,
