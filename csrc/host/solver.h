@@ -299,8 +299,8 @@ struct SolverOps {
     s.viscous = real_at(kViscous);
     s.object = int_at(kObject);
     s.own = real_at(kOwn);
-    // velocity and spin keep the square of the share, rates of strain its root (docs/theory/mpm.md)
-    const double slow = floats[kFlip] * floats[kFlip], fast = std::sqrt(floats[kFlip]);
+    // velocity and spin keep the share itself, rates of strain its root (docs/theory/mpm.md)
+    const double slow = floats[kFlip], fast = std::sqrt(slow);
     s.kept_speed = static_cast<T>(slow);
     s.kept_slope = static_cast<T>(0.5 * (fast + slow));
     s.kept_across = static_cast<T>(0.5 * (fast - slow));
