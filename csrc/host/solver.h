@@ -3,6 +3,7 @@
 // names. An empty tensor stands for a part the scene does not use.
 #pragma once
 
+#include <cmath>
 #include <cstring>
 
 #include "core/collider/collider.h"
@@ -298,7 +299,11 @@ struct SolverOps {
     s.viscous = real_at(kViscous);
     s.object = int_at(kObject);
     s.own = real_at(kOwn);
-    s.flip = static_cast<T>(floats[kFlip]);
+    // velocity and spin keep the share itself, rates of strain its root (docs/theory/mpm.md)
+    const double slow = floats[kFlip], fast = std::sqrt(slow);
+    s.kept_speed = static_cast<T>(slow);
+    s.kept_slope = static_cast<T>(0.5 * (fast + slow));
+    s.kept_across = static_cast<T>(0.5 * (fast - slow));
     s.free_velocity = real_at(kFreeVelocity);
     s.spring_rows = static_cast<double*>(any_at(kSpringRows));
     s.push = static_cast<int64_t*>(any_at(kPush));

@@ -124,6 +124,14 @@ class SolveSettings:
         "points",
         default="nodes",
     )
+    inertia: str = key(
+        choice("grid", "body"),
+        "What elastic bodies turn with: the `grid` spreads each mass over a cell, so that a rod "
+        "four cells thick twists 8 % too slowly; `body` shares the mass out among its points so "
+        "that the body has its own inertia (2 %). Not with `contact: points`.",
+        "body",
+        default="grid",
+    )
     devices: str = key(
         choice("one", "all"),
         "`all`: where the grid holds 1000000 points or more, all GPUs of this machine work at it, "

@@ -27,6 +27,7 @@ __getattr__, __dir__, __all__ = lazy(
         ),
         "gsfluent.ops.solver": ("Solver", "SolverError"),
         "gsfluent.ops.average": ("kernel_average",),
+        "gsfluent.ops.inertia": ("inertial_shares",),
         "gsfluent.ops.heat": (
             "conduct",
             "enthalpy",

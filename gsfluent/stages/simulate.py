@@ -118,6 +118,7 @@ def moving_settings(shot: Shot) -> list[Any]:
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
         # as it was before there was a choice, where none is made
         [shot.solve.standing, *([shot.solve.contact] if shot.solve.contact != "nodes" else [])],
+        *([shot.solve.inertia] if shot.solve.inertia != "grid" else []),
         *([] if shot.heat is None else [dataclasses.asdict(shot.heat)]),
         shot.output.fps,
         shot.output.seconds,
@@ -132,6 +133,7 @@ def solver_options(shot: Shot) -> SolverOptions:
         standing=solve.standing,
         deterministic=solve.deterministic,
         surface=solve.contact == "points",
+        inertia=solve.inertia == "body",
         all_devices=solve.devices == "all",
     )
 

@@ -317,12 +317,17 @@ GSF_HOST_DEVICE ParticleBefore<T> particle_before(const SolverView<T>& s, int64_
 
 // Of its own motion, leaves the share that a particle keeps of what the transfer alone would take:
 // it gathered `value` and `first` from nodes on which nothing acts but what `own` gave to them.
+// Velocity and spin keep one share, or angular momentum would not be; what strains keeps another.
 template <typename T>
 GSF_HOST_DEVICE void leave_share(const SolverView<T>& s, const T* value, const Mat3<T>& first,
                                  ParticleBefore<T>& b) {
   const T mass = s.rows[int64_t(b.row) * kRowColumns + kMassColumn], scale = T(4) * s.inv_dx;
-  for (int i = 0; i < 3; ++i) b.velocity[i] = s.flip * (b.velocity[i] - value[i]);
-  for (int i = 0; i < 9; ++i) b.own[i] = s.flip * (b.own[i] - mass * (scale * first.m[i]));
+  for (int i = 0; i < 3; ++i) b.velocity[i] = s.kept_speed * (b.velocity[i] - value[i]);
+  Mat3<T> lost;
+  for (int i = 0; i < 9; ++i) lost.m[i] = b.own[i] - mass * (scale * first.m[i]);
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      b.own[3 * i + j] = s.kept_slope * lost(i, j) + s.kept_across * lost(j, i);
 }
 
 // Whether a step looks at wave speeds and gradients: every step for liquids and other laws whose

@@ -229,10 +229,11 @@ struct SolverView {
   // [fields] object of each field: points of different ones push each other
   // (core/collider/touch.h); or null: fields meet at nodes
   const int32_t* object;
-  // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the share of their
-  // own motion that points keep in a step (leave_share); or null and 0
+  // [N, 9] m C of each point without the stress that `slope` holds [kg/s], and the shares of their
+  // own motion that points keep in a step (leave_share): of velocity, and of m C and its transpose;
+  // or null and 0
   T* own;
-  T flip;
+  T kept_speed, kept_slope, kept_across;
   // of scenes with one of these three, on CUDA: node velocities of the pass without forces; volume
   // [cells] and stiffness [Pa] of the points of each row, the fastest P-wave and the largest
   // stiffness, and the largest that colliders and other points give to a point in this step, as

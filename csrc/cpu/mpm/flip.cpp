@@ -59,14 +59,18 @@ struct FlipPass<T>::Passes {
         const Packet<T> packet(view, view.entry + i, r.end - i);
         Pack<T> offset[3], v[3], own[9];
         const PacketGathered<T> back = chunk.gathered(i - at, offset);
-        const Pack<T> share(view.flip), scale(T(4) * view.inv_dx);
+        const Pack<T> speed(view.kept_speed), slope(view.kept_slope), across(view.kept_across);
+        const Pack<T> scale(T(4) * view.inv_dx);
         const Pack<T> mass = pack_of<T>([&](int lane) {
           return view.rows[int64_t(view.row_of(packet.meta[lane])) * kRowColumns + kMassColumn];
         });
         packet.load3(view.velocity, v);
         packet.load9(view.own, own);
-        for (int c = 0; c < 3; ++c) v[c] = share * (v[c] - back.value[c]);
-        for (int c = 0; c < 9; ++c) own[c] = share * (own[c] - mass * (scale * back.first.m[c]));
+        for (int c = 0; c < 3; ++c) v[c] = speed * (v[c] - back.value[c]);
+        Pack<T> lost[9];
+        for (int c = 0; c < 9; ++c) lost[c] = own[c] - mass * (scale * back.first.m[c]);
+        for (int c = 0; c < 9; ++c)  // leave_share
+          own[c] = slope * lost[c] + across * lost[c % 3 * 3 + c / 3];
         packet.store3(v, view.velocity, packet.active);
         packet.store9(own, view.own, packet.active);
       }

@@ -293,7 +293,11 @@ class Stepper:
         momentum, mass = free[..., :3], free[..., 3:]
         nodes = torch.where(mass > 1e-30, momentum / mass.clamp(min=1e-30), 0.0)
         _, v, c, _ = ops.g2p(nodes, place, dx=scene.dx, dt=0.0, blocks=blocks, body=body)
-        return scene.flip * (velocity - v), scene.flip * (affine - c)
+        slow, fast = scene.flip, scene.flip**0.5  # docs/theory/mpm.md
+        lost = affine - c
+        across = lost.transpose(1, 2)
+        shear, spin = 0.5 * (lost + across), 0.5 * (lost - across)
+        return slow * (velocity - v), fast * shear + slow * spin
 
     def _pushed(
         self, grid: Tensor, blocks: ops.Blocks, dt: float, body: Tensor | None

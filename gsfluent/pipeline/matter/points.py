@@ -32,6 +32,8 @@ _log = logging.getLogger(__name__)
 POINTS_PER_CELL = 8
 MAX_PARTICLES = 8_000_000
 """Material points that a simulation refuses to exceed unless told otherwise."""
+LASTING = ("elastic", "yeoh", "ogden", "von_mises")
+"""Laws of matter whose points stay beside each other."""
 _WAVES = 128
 ALPHA_JITTER = 0.15
 """Relative half-width of the uniform weakness noise that seeds cracks (equations.md section 17)."""
@@ -157,11 +159,13 @@ def build_matter(
     jitter: float = ALPHA_JITTER,
     device: torch.device | str = "cpu",
     max_particles: int = MAX_PARTICLES,
+    inertia: bool = False,
 ) -> Matter:
     """Sample all bodies of a scene at :data:`POINTS_PER_CELL` points per cell of edge ``dx``.
 
     The mass of a body is its density times its voxel volume; each point has the same share of the
-    volume (``V_object / N``), so surface cells are not over-weighted.
+    volume (``V_object / N``), so surface cells are not over-weighted. With ``inertia`` it is shared
+    out unevenly in bodies that do not break or flow (:func:`gsfluent.ops.inertial_shares`).
 
     Args:
         scene: The scene; it must hold at least one body.
@@ -170,6 +174,7 @@ def build_matter(
         jitter: Relative half-width of the noise on ``alpha0``.
         device: Device of the result.
         max_particles: Refuse more than this.
+        inertia: Give bodies of :data:`LASTING` laws their own moments of inertia on the grid.
 
     Raises:
         InputError: No body, too many points, or nothing inside a solid.
@@ -207,6 +212,12 @@ def build_matter(
         noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
         params, law, alpha, viscous = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
+        if inertia and bool(
+            torch.isin(law, law.new_tensor([materials.LAWS[n] for n in LASTING])).all()
+        ):
+            each = torch.full((count,), volume / count, dtype=torch.float64)
+            place = points * body.frame.scale
+            mass = mass * ops.inertial_shares(place, volume=each, dx=dx)
         position, velocity, affine = start_of(body, scene, points, mass)
         tables.append(params)
         laws.append(law)

@@ -314,6 +314,7 @@ class Simulate(Stage):
             jitter=self.jitter,
             device=scene.device if self.device is None else self.device,
             max_particles=self.max_particles,
+            inertia=self.options.inertia,
         )
         matter = thawing(scene, matter)
         if not self.splats:
