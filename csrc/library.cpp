@@ -77,6 +77,13 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def(
       "carry_axes(Tensor quats, Tensor scales, Tensor map, Tensor rotation, float rigid) -> "
       "(Tensor, Tensor)");
+  m.def("quats_to_matrices(Tensor quats) -> Tensor");
+  m.def("matrices_to_quats(Tensor matrices) -> Tensor");
+  m.def("quat_products(Tensor left, Tensor right) -> Tensor");
+  m.def(
+      "link_states(Tensor position, Tensor apart, Tensor near, Tensor piece, Tensor? broken, "
+      "Tensor? parted_before, Tensor? opened_before, Tensor none, float together, float loose, "
+      "float open, float back) -> (Tensor parted, Tensor opened, Tensor ratio)");
   m.def(
       "cut_at_cells(Tensor means, Tensor quats, Tensor scales, Tensor owner, Tensor near, "
       "Tensor opened, Tensor rest, float slack) -> (Tensor, Tensor, Tensor, Tensor)");

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.ops import turns
+
 SH0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
@@ -31,6 +33,9 @@ def normalize_quaternions(quats: Tensor) -> Tensor:
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] (``wxyz``, normalised here)."""
+    if turns.served(quats):
+        made = turns.quats_to_matrices(quats.reshape(-1, 4))
+        return made.view(*quats.shape[:-1], 3, 3)
     w, x, y, z = normalize_quaternions(quats).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -46,6 +51,9 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
     The four squared components follow from the diagonal; dividing by the largest of them keeps
     every case well conditioned (Shepperd 1978).
     """
+    if turns.served(matrix):
+        made = turns.matrices_to_quats(matrix.reshape(-1, 3, 3))
+        return made.view(*matrix.shape[:-2], 4)
     m = matrix
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squares = torch.stack(
@@ -69,6 +77,8 @@ def matrix_to_quaternion(matrix: Tensor) -> Tensor:
 
 def quaternion_multiply(left: Tensor, right: Tensor) -> Tensor:
     """Hamilton product [..., 4]: rotate by ``right`` first, then by ``left``."""
+    if left.shape == right.shape and turns.served(left, right):
+        return turns.quat_products(left.reshape(-1, 4), right.reshape(-1, 4)).view(left.shape)
     w1, x1, y1, z1 = left.unbind(-1)
     w2, x2, y2, z2 = right.unbind(-1)
     return torch.stack(

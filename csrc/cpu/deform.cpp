@@ -5,6 +5,8 @@
 
 #include "core/deform/carry.h"
 #include "core/deform/cut.h"
+#include "core/deform/link.h"
+#include "core/deform/turn.h"
 #include "cpu/svd.h"
 
 namespace gsf {
@@ -84,6 +86,30 @@ struct DeformCpu {
   static void carry_place(const CarryPlaceArgs<T>& a, const Scope&) {
     parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::carry_place(a, i);
+    });
+  }
+  template <typename T>
+  static void quats_to_matrices(const TurnArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 4096, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::quats_to_matrices(a, i);
+    });
+  }
+  template <typename T>
+  static void matrices_to_quats(const TurnArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 4096, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::matrices_to_quats(a, i);
+    });
+  }
+  template <typename T>
+  static void quat_products(const TurnArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 4096, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::quat_products(a, i);
+    });
+  }
+  template <typename T>
+  static void link_states(const LinkStatesArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 4096, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) gsf::link_states(a, i);
     });
   }
   template <typename T>

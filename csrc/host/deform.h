@@ -96,6 +96,78 @@ struct DeformOps {
     return {new_quats, new_scales};
   }
 
+  static Tensor quats_to_matrices(Tensor quats) {
+    quats = ready("quats_to_matrices", "quats", quats, quats, {-1, 4});
+    return turned(
+        quats, OptTensor(), {quats.size(0), 3, 3},
+        [](const auto& args, const auto& scope) { Backend::quats_to_matrices(args, scope); });
+  }
+
+  static Tensor matrices_to_quats(Tensor matrices) {
+    matrices = ready("matrices_to_quats", "matrices", matrices, matrices, {-1, 3, 3});
+    return turned(
+        matrices, OptTensor(), {matrices.size(0), 4},
+        [](const auto& args, const auto& scope) { Backend::matrices_to_quats(args, scope); });
+  }
+
+  static Tensor quat_products(Tensor left, Tensor right) {
+    const char* op = "quat_products";
+    left = ready(op, "left", left, left, {-1, 4});
+    right = ready(op, "right", right, left, {left.size(0), 4});
+    return turned(left, right, {left.size(0), 4},
+                  [](const auto& args, const auto& scope) { Backend::quat_products(args, scope); });
+  }
+
+  static std::tuple<Tensor, Tensor, Tensor> link_states(Tensor position, Tensor apart, Tensor near,
+                                                        Tensor piece, OptTensor broken,
+                                                        OptTensor parted_before,
+                                                        OptTensor opened_before, Tensor none,
+                                                        double together, double loose, double open,
+                                                        double back) {
+    const char* op = "link_states";
+    near = ready(op, "near", near, near, {-1, -1}, ScalarType::Long);
+    const int64_t points = near.size(0), k = near.size(1), all = position.size(0);
+    position = ready(op, "position", position, near, {all, 3}, position.scalar_type());
+    STD_TORCH_CHECK(all >= points, op, ": position must have a row for every point");
+    apart = ready(op, "apart", apart, position, {points, k});
+    piece = ready(op, "piece", piece, position, {all}, ScalarType::Int);
+    broken = ready(op, "broken", broken, position, {all}, ScalarType::Bool);
+    STD_TORCH_CHECK(parted_before.has_value() == opened_before.has_value(), op,
+                    ": parted_before and opened_before come together");
+    parted_before =
+        ready(op, "parted_before", parted_before, position, {points, k}, ScalarType::Bool);
+    opened_before =
+        ready(op, "opened_before", opened_before, position, {points, k}, ScalarType::Bool);
+    none = ready(op, "none", none, position, {points, k}, ScalarType::Bool);
+    Tensor parted = gsf::new_empty(position, {points, k}, ScalarType::Bool);
+    Tensor opened = gsf::new_empty(position, {points, k}, ScalarType::Bool);
+    Tensor ratio = gsf::new_empty(position, {points, k}, position.scalar_type());
+    const typename Backend::Scope scope(position);
+    dispatch_floating(op, position, [&]<typename T>() {
+      if (points * k == 0) return;
+      const LinkStatesArgs<T> args{points * k,
+                                   points,
+                                   static_cast<int>(k),
+                                   cptr<T>(position),
+                                   cptr<T>(apart),
+                                   cptr<int64_t>(near),
+                                   cptr<int32_t>(piece),
+                                   cptr<bool>(broken),
+                                   cptr<bool>(parted_before),
+                                   cptr<bool>(opened_before),
+                                   cptr<bool>(none),
+                                   T(together),
+                                   T(loose),
+                                   T(open),
+                                   T(back),
+                                   mptr<bool>(parted),
+                                   mptr<bool>(opened),
+                                   mptr<T>(ratio)};
+      Backend::link_states(args, scope);
+    });
+    return {parted, opened, ratio};
+  }
+
   static std::tuple<Tensor, Tensor, Tensor, Tensor> cut_at_cells(Tensor means, Tensor quats,
                                                                  Tensor scales, Tensor owner,
                                                                  Tensor near, Tensor opened,
@@ -180,8 +252,26 @@ struct DeformOps {
     GSF_IMPL(DeformOps, covariance_axes);
     GSF_IMPL(DeformOps, carry_place);
     GSF_IMPL(DeformOps, carry_axes);
+    GSF_IMPL(DeformOps, quats_to_matrices);
+    GSF_IMPL(DeformOps, matrices_to_quats);
+    GSF_IMPL(DeformOps, quat_products);
+    GSF_IMPL(DeformOps, link_states);
     GSF_IMPL(DeformOps, cut_at_cells);
     GSF_IMPL(DeformOps, cut_by_planes);
+  }
+
+ private:
+  // One of the ops of turn.h: `run(args, scope)`.
+  template <typename Run>
+  static Tensor turned(const Tensor& first, const OptTensor& second,
+                       const std::vector<int64_t>& shape, const Run& run) {
+    Tensor out = gsf::new_empty(first, shape, first.scalar_type());
+    const typename Backend::Scope scope(first);
+    dispatch_floating("turns", first, [&]<typename T>() {
+      if (shape[0] == 0) return;
+      run(TurnArgs<T>{shape[0], cptr<T>(first), cptr<T>(second), mptr<T>(out)}, scope);
+    });
+    return out;
   }
 };
 

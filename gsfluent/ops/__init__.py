@@ -42,6 +42,7 @@ __getattr__, __dir__, __all__ = lazy(
             "carry_place",
             "cut_at_cells",
             "cut_by_planes",
+            "link_states",
         ),
         "gsfluent.ops.mvee": ("mvee", "mvee_lens"),
         "gsfluent.ops.raster": ("Recorded", "Rendered", "rasterize", "rasterize_recorded"),

@@ -256,6 +256,70 @@ def cut_by_planes(
     return new_means, quats, scales
 
 
+def link_states(
+    position: Tensor,
+    apart: Tensor,
+    near: Tensor,
+    piece: Tensor,
+    *,
+    none: Tensor,
+    together: float,
+    loose: float,
+    open: float,
+    back: float,
+    broken: Tensor | None = None,
+    before: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What of the links between points and their neighbours has parted, and where gaps show.
+
+    A link is as long as ``r`` times its length at rest. It has parted when its ends are of two
+    pieces, or r is above a limit: ``together`` within a piece, ``loose`` where an end is broken or
+    in no piece. Of the links that have parted those show a gap whose r is above ``open``. What has
+    parted or shows a gap does so down to ``back`` times its limit.
+
+    Args:
+        position: Points now [m], shape [M, 3], M >= N, float32 or float64.
+        apart: Lengths at rest [m], [N, K].
+        near: Neighbours of every point, int64 [N, K]; one that is no row counts as the point.
+        piece: Piece of each point, int32 [M], negative for none.
+        none: What stands for no link: parted, without a gap, bool [N, K].
+        together: Limit of r within a piece.
+        loose: Limit of r elsewhere.
+        open: r from which a gap shows.
+        back: See above.
+        broken: Broken points, bool [M].
+        before: What had parted and what showed a gap at the last look, both bool [N, K].
+
+    Returns:
+        What has parted and what shows a gap, both bool [N, K], and r, [N, K]; 1 for a point and
+        itself.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape or device is wrong.
+
+    Gradient: none.
+    """
+    op = "link_states"
+    check_tensor(op, "position", position, shape=("M", 3))
+    count = position.shape[0]
+    check_tensor(op, "near", near, shape=("N", "K"), dtype=torch.int64, like=position)
+    if near.shape[0] > count:
+        raise ValueError(f"{op}: position has {count} rows for {near.shape[0]} points; pass all")
+    check_tensor(op, "apart", apart, shape=near.shape, like=position)
+    check_tensor(op, "piece", piece, shape=(count,), dtype=torch.int32, like=position)
+    check_tensor(op, "none", none, shape=near.shape, dtype=torch.bool, like=position)
+    if broken is not None:
+        check_tensor(op, "broken", broken, shape=(count,), dtype=torch.bool, like=position)
+    for value in before or ():
+        check_tensor(op, "before", value, shape=near.shape, dtype=torch.bool, like=position)
+    parted, opened, ratio = torch.ops.gsfluent.link_states.default(
+        position, apart, near, piece, broken, *(before or (None, None)), none,
+        float(together), float(loose), float(open), float(back),
+    )  # fmt: skip
+    return parted, opened, ratio
+
+
 def _like_both(a: Tensor, b: Tensor, *rest: object) -> tuple[Tensor, Tensor]:
     return a.new_empty(a.shape), b.new_empty(b.shape)
 
@@ -269,10 +333,14 @@ fakes(
         owner.new_empty(owner.shape, dtype=torch.bool),
         *(v.new_empty(v.shape) for v in (m, q, s)),
     ),
+    link_states=lambda p, apart, near, *rest: (
+        *(near.new_empty(near.shape, dtype=torch.bool) for _ in range(2)),
+        apart.new_empty(apart.shape),
+    ),
     cut_by_planes=lambda m, *rest: tuple(m.new_empty((len(m), n)) for n in (3, 4, 3)),
 )
 no_gradient("polar_clamped: no gradient with respect to deformation", "polar_clamped")
 no_gradient(
     "axes of Gaussians: no gradient", "carry_place", "covariance_axes", "carry_axes",
-    "cut_at_cells", "cut_by_planes",
+    "cut_at_cells", "cut_by_planes", "link_states",
 )  # fmt: skip

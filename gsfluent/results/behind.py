@@ -31,14 +31,25 @@ class Behind:
     Args:
         room: How much may wait, what is being done among it.
         device: Where it computes; None or a CPU needs nothing.
+        threads: With how many threads torch computes in it; None for as many as elsewhere.
     """
 
-    def __init__(self, room: int = ROOM, device: torch.device | None = None) -> None:
+    def __init__(
+        self,
+        room: int = ROOM,
+        device: torch.device | None = None,
+        *,
+        threads: int | None = None,
+    ) -> None:
         self._room, self._failed = room, False
         on_gpu = device is not None and device.type == "cuda"
         self._stream = torch.cuda.Stream(device) if on_gpu else None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gsfluent-behind")
         self._given: deque[Future[Any]] = deque()
+        if threads is not None:
+            here = torch.get_num_threads()
+            self._pool.submit(_compute_with, threads).result()
+            torch.set_num_threads(here)  # for threads that compute for the first time later
 
     def __enter__(self) -> Behind:
         return self
@@ -96,6 +107,12 @@ class Behind:
     def _settle(self, most: int) -> None:
         while len(self._given) > most:
             self._given.popleft().result()
+
+
+def _compute_with(threads: int) -> None:
+    """Have torch compute with so many threads in the thread that asks."""
+    torch.get_num_threads()  # the first look takes the number of all, and would undo the next line
+    torch.set_num_threads(threads)
 
 
 def held_here(*values: Any) -> None:

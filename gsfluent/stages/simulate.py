@@ -214,7 +214,10 @@ def simulate_stage(context: RunContext) -> None:
                 cost = saved_at - begun
 
         with Behind() as files:
-            with Behind(AHEAD, frames.run.matter.particles.device) as repair:
+            # Small operations of two teams wait for each other's threads more than they compute.
+            half = max(1, torch.get_num_threads() // 2)
+            device = frames.run.matter.particles.device
+            with Behind(AHEAD, device, threads=half) as repair:
                 while (moment := frames.advance()) is not None:
                     repair.do(finish, moment)
             keep(ended=True)

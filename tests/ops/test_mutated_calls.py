@@ -74,6 +74,14 @@ def calls() -> dict[str, Call]:
         lib.cut_at_cells(*splat, torch.randint(0, 7, (9,)), near, opened, torch.randn(7, 3), 0.1)
         planes = (torch.randn(12, 3), torch.randn(12), torch.rand(12))
         lib.cut_by_planes(splat[0], splat[0], torch.rand(9, 6), torch.arange(10), *planes)
+        lib.quats_to_matrices(splat[1])
+        lib.matrices_to_quats(torch.randn(9, 3, 3))
+        lib.quat_products(splat[1], splat[1])
+        flags = (opened, opened, opened)
+        lib.link_states(
+            splat[0], torch.rand(7, 4), near, torch.randint(-1, 3, (9,), dtype=torch.int32),
+            torch.rand(9) < 0.5, *flags, 1.2, 1.5, 1.1, 0.9,
+        )  # fmt: skip
         lib.splat_bulk(torch.rand(50, 3), torch.rand(50, 3))
         picture = torch.rand(32, 32, 3)
         lib.ssim(picture, picture.flip(1), True)
@@ -83,7 +91,8 @@ def calls() -> dict[str, Call]:
 NAMES = (
     "build_blocks p2g grid_update g2p p2g_adjoint transfer_slope return_mapping "
     "return_mapping_adjoint rasterize rasterize_backward collider_distance advance_colliders mvee "
-    "polar_clamped covariance_axes cut_at_cells cut_by_planes splat_bulk ssim"
+    "polar_clamped covariance_axes cut_at_cells cut_by_planes "
+    "quats_to_matrices matrices_to_quats quat_products link_states splat_bulk ssim"
 ).split()
 
 

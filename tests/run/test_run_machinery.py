@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import mmap
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +285,25 @@ def test_what_is_written_behind_the_work_keeps_its_order_and_its_errors() -> Non
         for number in (5, 3, 6):
             behind.do(write, number)
     assert done == [0, 1, 2, 4, 5]
+
+
+def test_what_is_done_behind_computes_with_threads_of_its_own() -> None:
+    def threads() -> None:
+        seen.append(torch.get_num_threads())
+
+    before, seen = torch.get_num_threads(), list[int]()
+    torch.set_num_threads(4)
+    try:
+        with Behind(threads=2) as behind:
+            behind.do(threads)
+            behind.wait()
+            other = threading.Thread(target=threads)
+            other.start()
+            other.join()
+            behind.do(threads)
+        assert seen == [2, 4, 2] and torch.get_num_threads() == 4
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.cuda

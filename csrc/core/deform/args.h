@@ -52,6 +52,35 @@ struct CarryPlaceArgs {
   T* blend;               // [count, 9]
 };
 
+// Rotations in two forms, and products of them (turn.h).
+template <typename T>
+struct TurnArgs {
+  int64_t count;
+  const T* first;   // [count, 4] or [count, 9]
+  const T* second;  // [count, 4]; products only
+  T* out;           // [count, 9] or [count, 4]
+};
+
+// Links between neighbouring points, at a moment (link.h).
+template <typename T>
+struct LinkStatesArgs {
+  int64_t count, points;      // links, points
+  int near_count;             // K; count = points * K
+  const T* position;          // [points or more, 3]
+  const T* apart;             // [points, K] lengths at rest
+  const int64_t* near;        // [points, K] neighbours of a point
+  const int32_t* piece;       // [points or more], -1 for none
+  const bool* broken;         // [points or more] or null
+  const bool* parted_before;  // [points, K] or null, and then the next one too
+  const bool* opened_before;  // [points, K]
+  const bool* none;           // [points, K] what stands for no link
+  T together, loose;          // ratios at which links within a piece and others part
+  T open, back;               // ratio of a gap; share of a ratio down to which it stays so
+  bool* parted;               // [points, K]
+  bool* opened;               // [points, K]
+  T* ratio;                   // [points, K]
+};
+
 // Splats cut where cells of points border on each other, and Gaussians cut by planes (cut.h).
 template <typename T>
 struct CutAtCellsArgs {

@@ -1,6 +1,8 @@
 // CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
 #include "core/deform/carry.h"
 #include "core/deform/cut.h"
+#include "core/deform/link.h"
+#include "core/deform/turn.h"
 #include "cuda/deform/launch.h"
 #include "cuda/threads.h"
 
@@ -33,6 +35,30 @@ template <typename T>
 __global__ void carry_axes_kernel(CarryAxesArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i < a.count) gsf::carry_axes(a, i);
+}
+
+template <typename T>
+__global__ void quats_to_matrices_kernel(TurnArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::quats_to_matrices(a, i);
+}
+
+template <typename T>
+__global__ void matrices_to_quats_kernel(TurnArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::matrices_to_quats(a, i);
+}
+
+template <typename T>
+__global__ void quat_products_kernel(TurnArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::quat_products(a, i);
+}
+
+template <typename T>
+__global__ void link_states_kernel(LinkStatesArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) gsf::link_states(a, i);
 }
 
 template <typename T>
@@ -73,6 +99,22 @@ cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, carry_axes_kernel<T>);
 }
 template <typename T>
+cudaError_t quats_to_matrices(const TurnArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, quats_to_matrices_kernel<T>);
+}
+template <typename T>
+cudaError_t matrices_to_quats(const TurnArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, matrices_to_quats_kernel<T>);
+}
+template <typename T>
+cudaError_t quat_products(const TurnArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, quat_products_kernel<T>);
+}
+template <typename T>
+cudaError_t link_states(const LinkStatesArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, link_states_kernel<T>);
+}
+template <typename T>
 cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, cut_at_cells_kernel<T>);
 }
@@ -89,6 +131,14 @@ template cudaError_t carry_place(const CarryPlaceArgs<float>&, cudaStream_t);
 template cudaError_t carry_place(const CarryPlaceArgs<double>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<float>&, cudaStream_t);
 template cudaError_t carry_axes(const CarryAxesArgs<double>&, cudaStream_t);
+template cudaError_t quats_to_matrices(const TurnArgs<float>&, cudaStream_t);
+template cudaError_t quats_to_matrices(const TurnArgs<double>&, cudaStream_t);
+template cudaError_t matrices_to_quats(const TurnArgs<float>&, cudaStream_t);
+template cudaError_t matrices_to_quats(const TurnArgs<double>&, cudaStream_t);
+template cudaError_t quat_products(const TurnArgs<float>&, cudaStream_t);
+template cudaError_t quat_products(const TurnArgs<double>&, cudaStream_t);
+template cudaError_t link_states(const LinkStatesArgs<float>&, cudaStream_t);
+template cudaError_t link_states(const LinkStatesArgs<double>&, cudaStream_t);
 template cudaError_t cut_at_cells(const CutAtCellsArgs<float>&, cudaStream_t);
 template cudaError_t cut_at_cells(const CutAtCellsArgs<double>&, cudaStream_t);
 template cudaError_t cut_by_planes(const CutByPlanesArgs<float>&, cudaStream_t);

@@ -20,6 +20,18 @@ template <typename T>
 cudaError_t carry_axes(const CarryAxesArgs<T>& args, cudaStream_t stream);
 
 template <typename T>
+cudaError_t quats_to_matrices(const TurnArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t matrices_to_quats(const TurnArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t quat_products(const TurnArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t link_states(const LinkStatesArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
 cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream);
 
 template <typename T>

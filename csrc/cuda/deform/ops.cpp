@@ -12,6 +12,10 @@ struct DeformCuda {
   GSF_LAUNCH(covariance_axes)
   GSF_LAUNCH(carry_place)
   GSF_LAUNCH(carry_axes)
+  GSF_LAUNCH(quats_to_matrices)
+  GSF_LAUNCH(matrices_to_quats)
+  GSF_LAUNCH(quat_products)
+  GSF_LAUNCH(link_states)
   GSF_LAUNCH(cut_at_cells)
   GSF_LAUNCH(cut_by_planes)
 };

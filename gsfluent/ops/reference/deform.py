@@ -62,6 +62,38 @@ def cut_at(
     return mean - h[:, None] * step, shrunk
 
 
+def link_states(
+    position: Tensor,
+    apart: Tensor,
+    near: Tensor,
+    piece: Tensor,
+    *,
+    none: Tensor,
+    together: float,
+    loose: float,
+    open: float,
+    back: float,
+    broken: Tensor | None = None,
+    before: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As :func:`gsfluent.ops.link_states`, of neighbours that are rows."""
+    count = near.shape[0]
+    own = near == torch.arange(count, device=near.device)[:, None]
+    now = (position[near] - position[:count, None]).norm(dim=2)
+    ratio = torch.where(own, 1.0, now / apart.clamp(min=1e-12))
+    mine, theirs = piece[:count, None], piece[near]
+    limit = torch.where(mine == theirs, together, loose)
+    limit = torch.where((mine < 0) | (theirs < 0), loose, limit)
+    if broken is not None:
+        limit = torch.where(broken[:count, None] | broken[near], loose, limit)
+    opening = torch.full_like(ratio, open)
+    if before is not None:
+        limit = torch.where(before[0], back * limit, limit)
+        opening = torch.where(before[1], back * opening, opening)
+    parted = (ratio > limit) | ((mine != theirs) & (mine >= 0) & (theirs >= 0))
+    return parted | none, parted & (ratio > opening) & ~none, ratio
+
+
 def cut_at_cells(
     means: Tensor,
     quats: Tensor,

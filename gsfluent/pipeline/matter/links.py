@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.pipeline.matter.fragments import STRETCH_LIMIT
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.spatial.neighbours import nearest_rows
@@ -74,8 +75,7 @@ class Links:
 
     def _measure(self, void: Tensor) -> None:
         self._apart = (self.rest[self.near] - self.rest[:, None]).norm(dim=2)
-        rows = torch.arange(self.near.shape[0], device=self.near.device)
-        self._own, self._void = self.near == rows[:, None], void
+        self._void = void
 
     def rewired(self, near: Tensor, void: Tensor) -> Links:
         """The same points with other neighbours.
@@ -105,23 +105,12 @@ class Links:
             before: The last look, if there was one.
             broken: Broken points, bool [N'].
         """
-        count = self.near.shape[0]
-        apart = (position[self.near] - position[:count, None]).norm(dim=2)
-        ratio = torch.where(self._own, 1.0, apart / self._apart.clamp(min=1e-12))
-        piece = fragments[:count, None]
-        other = piece[self.near, 0]
-        limit = torch.where(piece == other, STRETCH_LIMIT, PARTED)
-        limit = torch.where((piece < 0) | (other < 0), PARTED, limit)
-        if broken is not None:
-            crack = broken[:count]
-            limit = torch.where(crack[:, None] | crack[self.near], PARTED, limit)
-        opening = torch.full_like(ratio, OPEN)
-        if before is not None:
-            limit = torch.where(before.parted, BACK * limit, limit)
-            opening = torch.where(before.opened, BACK * opening, opening)
-        parted = (ratio > limit) | ((piece != other) & (piece >= 0) & (other >= 0))
-        opened = parted & (ratio > opening) & ~self._void
-        return Hanging(parted | self._void, opened, ratio)
+        states = ops.link_states(
+            position, self._apart, self.near, fragments, none=self._void,
+            together=STRETCH_LIMIT, loose=PARTED, open=OPEN, back=BACK, broken=broken,
+            before=None if before is None else (before.parted, before.opened),
+        )  # fmt: skip
+        return Hanging(*states)
 
     def restored(self, state: dict[str, Any]) -> Hanging:
         """The last look of another run, from :meth:`Hanging.state`."""
