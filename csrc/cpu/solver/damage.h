@@ -8,6 +8,25 @@
 
 namespace gsf::cpu {
 
+// Of the 27 blocks around a home, those that the stencil of a particle touches, by the nine bits of
+// l in a meta word.
+struct ReachTable {
+  uint32_t blocks[512];
+  ReachTable() : blocks{} {
+    for (uint32_t word = 0; word < 512; ++word)
+      for (int corner = 0; corner < 8; ++corner) {
+        int block = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          const int stored = static_cast<int>(word >> (3 * axis) & 7u);
+          const int l = stored < kLastCell ? stored : kLastCell;
+          block = 3 * block + window_block(l + (corner >> axis & 1) * 2);
+        }
+        blocks[word] |= 1u << block;
+      }
+  }
+};
+inline const ReachTable kReach;
+
 template <typename T>
 class DamagePass {
  public:
@@ -25,14 +44,7 @@ class DamagePass {
   }
 
   // Again after each build.
-  void plan() {
-    const SolverClock& c = *s_.clock;
-    keys_.resize(c.slots);
-    for (int64_t i = 0; i < c.slots; ++i) {
-      const int32_t* b = s_.slot_coord + 4 * i;
-      keys_[i] = block_key(b[0], b[1], b[2], b[3]);
-    }
-  }
+  void plan() { around_.clear(); }
 
   // One solve; peaks of the points after it.
   void run(const HomePass<T>& pass) {
@@ -45,11 +57,26 @@ class DamagePass {
 
  private:
   bool is_phase(int64_t p) const { return s_.law[s_.row_of(s_.meta[p])] == kPhaseField; }
-  int32_t slot_around(const int32_t* b, int n) const {
-    const uint64_t wanted =
-        block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
-    const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
-    return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+  // Slots around each slot, -1 where there is none; looked up once after a build.
+  void look_around() {
+    const int64_t slots = s_.clock->slots;
+    if (!around_.empty() || slots == 0) return;
+    std::vector<uint64_t> keys(slots);
+    const auto key = [&](int64_t slot, int n) {
+      const int32_t* b = s_.slot_coord + 4 * slot;
+      return block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+    };
+    for (int64_t i = 0; i < slots; ++i) keys[i] = key(i, 13);
+    around_.resize(slots * kNeighbours);
+    parallel_for(slots, 64, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        for (int n = 0; n < kNeighbours; ++n) {
+          const uint64_t wanted = key(i, n);
+          const auto at = std::lower_bound(keys.begin(), keys.end(), wanted);
+          around_[i * kNeighbours + n] =
+              at != keys.end() && *at == wanted ? static_cast<int32_t>(at - keys.begin()) : -1;
+        }
+    });
   }
   template <typename F>
   void for_particles(int64_t h, const F& f) const {
@@ -81,13 +108,14 @@ class DamagePass {
       }
     });
     if (!any) return false;
+    look_around();
     slots_.clear();
     std::vector<int32_t> seeds;
     for (int64_t i = 0; i < c.slots; ++i)
       if (number_[i] == 0) seeds.push_back(static_cast<int32_t>(i));
     for (const int32_t seed : seeds)
       for (int n = 0; n < kNeighbours; ++n) {
-        const int32_t slot = slot_around(s_.slot_coord + 4 * int64_t(seed), n);
+        const int32_t slot = around_[kNeighbours * int64_t(seed) + n];
         if (slot >= 0) number_[slot] = 0;
       }
     for (int64_t i = 0; i < c.slots; ++i)
@@ -123,17 +151,23 @@ class DamagePass {
     });
   }
   // f(first, last) for the stretches of home h's particles, in the order of their cells, that share
-  // a cell and fit into a packet.
+  // a cell, fit into a packet and touch one of these of the 27 blocks.
   template <typename F>
-  void for_each_cell(const HomePass<T>& pass, int64_t h, const F& f) const {
+  void for_each_cell(const HomePass<T>& pass, int64_t h, uint32_t blocks, const F& f) const {
     const auto r = pass.range(h);
     for (int64_t at = r.begin; at < r.end;) {
       const uint32_t cell = s_.meta[s_.entry[at]] & 511u;
       int64_t last = at + 1;
       while (last < r.end && last < at + kLanes && (s_.meta[s_.entry[last]] & 511u) == cell) ++last;
-      f(at, last);
+      if ((kReach.blocks[cell] & blocks) != 0) f(at, last);
       at = last;
     }
+  }
+  static uint32_t block_bit(int t) {  // of place t of the window
+    return 1u << ((window_block(t / (kWindowEdge * kWindowEdge)) * 3 +
+                   window_block(t / kWindowEdge % kWindowEdge)) *
+                      3 +
+                  window_block(t % kWindowEdge));
   }
 
   // What the lanes of a packet give, four numbers each; nothing where another law is.
@@ -163,9 +197,13 @@ class DamagePass {
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
           Sums sums[kWindowNodes];
-          for_each_run(pass, homes[i],
-                       [&](int t, int64_t, int run) { std::fill_n(sums + t, run, Sums{}); });
-          for_each_cell(pass, homes[i],
+          uint32_t live = 0;  // blocks that take part
+          for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
+            std::fill_n(sums + t, run, Sums{});
+            if (row >= 0) live |= block_bit(t);
+          });
+          if (live == 0) continue;
+          for_each_cell(pass, homes[i], live,
                         [&](int64_t at, int64_t last) { scatter_cell(at, last, sums); });
           for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
             for (int n = 0; row >= 0 && n < run; ++n) nodes_[row + n] += sums[t + n];
@@ -210,9 +248,9 @@ class DamagePass {
     field_.resize(nodes_.size());
     parallel_for(count, 1, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
-        const int32_t* coord = s_.slot_coord + 4 * int64_t(slots_[b]);
         int32_t face[6];  // slots beyond the faces
-        for (int f = 0; f < 6; ++f) face[f] = slot_around(coord, face_block(f));
+        for (int f = 0; f < 6; ++f)
+          face[f] = around_[kNeighbours * int64_t(slots_[b]) + face_block(f)];
         for (int local = 0; local < kBlockNodes; ++local) {
           const int64_t n = b * kBlockNodes + local;
           const Sums& node = nodes_[n];
@@ -260,15 +298,18 @@ class DamagePass {
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
-          T field[kWindowNodes], most(0);
+          T field[kWindowNodes];
+          uint32_t live = 0;  // elsewhere no point gets more than it has
           for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
+            T most(0);
             for (int n = 0; n < run; ++n) {
               field[t + n] = row >= 0 ? T(field_[row + n]) : T(0);
               most = std::max(most, field[t + n]);
             }
+            if (most > T(0)) live |= block_bit(t);
           });
-          if (most == T(0)) continue;  // no point gets more than it has
-          for_each_cell(pass, homes[i],
+          if (live == 0) continue;
+          for_each_cell(pass, homes[i], live,
                         [&](int64_t at, int64_t last) { gather_cell(at, last, field); });
         }
       });
@@ -302,8 +343,8 @@ class DamagePass {
   const SolverView<T>& s_;
   bool at2_ = false, alone_ = true;  // alone: there is no other law
   double empty_ = 0.0;
-  T active_;  // alpha from which a point takes part
-  std::vector<uint64_t> keys_;
+  T active_;                             // alpha from which a point takes part
+  std::vector<int32_t> around_;          // [slots, 27], or empty
   std::vector<int32_t> homes_[kColors];  // homes that take part, by colour
   std::vector<int32_t> number_;          // [slots] row of an active slot, or -1
   std::vector<int32_t> slots_;           // active slots
