@@ -27,14 +27,13 @@ enum DamageCount : int { kHotCount, kActiveCount, kHomeCount };
 inline constexpr int kScaleAt2 = kDamageSums, kScaleEmpty = kDamageSums + 1;
 enum DamageFace : int32_t { kNoBlock = -1, kUndamaged = -2 };
 
-// What a point gives before its weights; `row` is its row of SolverView::rows.
+// What a point gives before its weights, of numbers or of packs of them: its volume, in the unit of
+// rows; the length in cells.
 template <typename T>
-GSF_HOST_DEVICE void damage_given(const T* row, T alpha, T peak, T inv_dx, double* out) {
-  const double volume = row[kStressColumn], length = double(row[4]) * double(inv_dx);
-  const double drive = double(alpha) + 1.0;
-  out[kDamageSum] = volume * double(damage_of(peak));
-  out[kDriveSum] = volume * (drive < kDriveMax ? drive : kDriveMax);
-  out[kStiffSum] = volume * 2.0 * length * length;
+GSF_HOST_DEVICE void damage_given(T volume, T length, T alpha, T peak, T* out) {
+  out[kDamageSum] = volume * damage_of(peak);
+  out[kDriveSum] = volume * min(alpha + T(1), T(kDriveMax));
+  out[kStiffSum] = volume * (T(2) * length * length);
   out[kVolumeSum] = volume;
 }
 

@@ -8,12 +8,34 @@
 
 namespace gsf::cpu {
 
+// Of the 27 blocks around a home, those that the stencil of a particle touches, by the nine bits of
+// l in a meta word.
+struct ReachTable {
+  uint32_t blocks[512];
+  ReachTable() : blocks{} {
+    for (uint32_t word = 0; word < 512; ++word)
+      for (int corner = 0; corner < 8; ++corner) {
+        int block = 0;
+        for (int axis = 0; axis < 3; ++axis) {
+          const int stored = static_cast<int>(word >> (3 * axis) & 7u);
+          const int l = stored < kLastCell ? stored : kLastCell;
+          block = 3 * block + window_block(l + (corner >> axis & 1) * 2);
+        }
+        blocks[word] |= 1u << block;
+      }
+  }
+};
+inline const ReachTable kReach;
+
 template <typename T>
 class DamagePass {
  public:
   explicit DamagePass(const SolverView<T>& s) : s_(s) {
     for (int64_t row = 0; row < s.row_count; ++row) {
-      if (s.law[row] != kPhaseField) continue;
+      if (s.law[row] != kPhaseField) {
+        alone_ = false;
+        continue;
+      }
       const T* r = s.rows + row * kRowColumns;
       at2_ = is_at2(load_material(r));
       empty_ = std::max(empty_, kEmptyNode * double(r[kStressColumn]));
@@ -22,37 +44,39 @@ class DamagePass {
   }
 
   // Again after each build.
-  void plan() {
-    const SolverClock& c = *s_.clock;
-    keys_.resize(c.slots);
-    for (int64_t i = 0; i < c.slots; ++i) {
-      const int32_t* b = s_.slot_coord + 4 * i;
-      keys_[i] = block_key(b[0], b[1], b[2], b[3]);
-    }
-    const HomeList<T>& list = s_.homes();
-    for (auto& color : colors_) color.clear();
-    for (int64_t h = 0; h < c.homes; ++h) {
-      const int32_t* b = list.coord + 4 * h;
-      colors_[(b[0] & 1) * 4 + (b[1] & 1) * 2 + (b[2] & 1)].push_back(static_cast<int32_t>(h));
-    }
-  }
+  void plan() { around_.clear(); }
 
   // One solve; peaks of the points after it.
-  void run() {
-    if (!find_active()) return;
-    scatter();
+  void run(const HomePass<T>& pass) {
+    if (!find_active(pass)) return;
+    scatter(pass);
     prepare();
     relax();
-    gather();
+    gather(pass);
   }
 
  private:
   bool is_phase(int64_t p) const { return s_.law[s_.row_of(s_.meta[p])] == kPhaseField; }
-  int32_t slot_around(const int32_t* b, int n) const {
-    const uint64_t wanted =
-        block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
-    const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
-    return at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+  // Slots around each slot, -1 where there is none; looked up once after a build.
+  void look_around() {
+    const int64_t slots = s_.clock->slots;
+    if (!around_.empty() || slots == 0) return;
+    std::vector<uint64_t> keys(slots);
+    const auto key = [&](int64_t slot, int n) {
+      const int32_t* b = s_.slot_coord + 4 * slot;
+      return block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+    };
+    for (int64_t i = 0; i < slots; ++i) keys[i] = key(i, 13);
+    around_.resize(slots * kNeighbours);
+    parallel_for(slots, 64, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        for (int n = 0; n < kNeighbours; ++n) {
+          const uint64_t wanted = key(i, n);
+          const auto at = std::lower_bound(keys.begin(), keys.end(), wanted);
+          around_[i * kNeighbours + n] =
+              at != keys.end() && *at == wanted ? static_cast<int32_t>(at - keys.begin()) : -1;
+        }
+    });
   }
   template <typename F>
   void for_particles(int64_t h, const F& f) const {
@@ -63,7 +87,7 @@ class DamagePass {
   }
 
   // Slots of points with damage or near their threshold, and those around them.
-  bool find_active() {
+  bool find_active(const HomePass<T>& pass) {
     const SolverClock& c = *s_.clock;
     number_.assign(c.slots, -1);
     std::atomic<bool> any{false};
@@ -84,13 +108,14 @@ class DamagePass {
       }
     });
     if (!any) return false;
+    look_around();
     slots_.clear();
     std::vector<int32_t> seeds;
     for (int64_t i = 0; i < c.slots; ++i)
       if (number_[i] == 0) seeds.push_back(static_cast<int32_t>(i));
     for (const int32_t seed : seeds)
       for (int n = 0; n < kNeighbours; ++n) {
-        const int32_t slot = slot_around(s_.slot_coord + 4 * int64_t(seed), n);
+        const int32_t slot = around_[kNeighbours * int64_t(seed) + n];
         if (slot >= 0) number_[slot] = 0;
       }
     for (int64_t i = 0; i < c.slots; ++i)
@@ -100,7 +125,7 @@ class DamagePass {
       }
     for (int color = 0; color < kColors; ++color) {
       homes_[color].clear();
-      for (const int32_t h : colors_[color]) {
+      for (const int32_t h : pass.colors_[color]) {
         bool meets = false;
         for (int n = 0; n < kNeighbours && !meets; ++n) {
           const int32_t slot = s_.neighbour[kNeighbours * int64_t(h) + n];
@@ -112,72 +137,120 @@ class DamagePass {
     return true;
   }
 
-  // Row of every node of the window of home h, -1 where it takes no part.
-  struct Window {
-    int32_t row[kWindowNodes];
-  };
-  Window window(int64_t h) const {
-    Window w;
-    for (int i = 0, at = 0; i < kWindowEdge; ++i)
-      for (int j = 0; j < kWindowEdge; ++j)
-        for (int k = 0; k < kWindowEdge; ++k, ++at) {
-          const int block = (window_block(i) * 3 + window_block(j)) * 3 + window_block(k);
-          const int32_t slot = s_.neighbour[kNeighbours * h + block];
-          const int32_t n = slot >= 0 && slot < s_.clock->slots ? number_[slot] : -1;
-          const int local = local_index(window_local(i), window_local(j), window_local(k));
-          w.row[at] = n >= 0 ? n * kBlockNodes + local : -1;
-        }
-    return w;
-  }
-  // f(node of the window, weight of x and y, weights of z) for the nine rows of nodes of particle
-  // p.
-  template <typename F>
-  void for_rows(int64_t p, const F& f) const {
-    const Stencil<T> stencil = stencil_at(s_.offset + 3 * p);
-    const int first = window_node(s_.meta[p]);
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j)
-        f(first + (i * kWindowEdge + j) * kWindowEdge, stencil.w[0][i] * stencil.w[1][j],
-          stencil.w[2]);
-  }
-
   using Sums = double __attribute__((vector_size(8 * kDamageSums)));
+  using P = Pack<T>;
+  static constexpr int kLanes = P::kLanes;
 
-  void scatter() {
+  // f(place in the window, row of the node, nodes in a row) for the nodes of home h; the row is
+  // below 0 where they take no part.
+  template <typename F>
+  void for_each_run(const HomePass<T>& pass, int64_t h, const F& f) const {
+    pass.for_each_run(h, [&](int t, int64_t node, int run) {
+      const int32_t n = number_[node / kBlockNodes];
+      f(t, n < 0 ? int64_t(-1) : n * int64_t(kBlockNodes) + node % kBlockNodes, run);
+    });
+  }
+  // f(first, last) for the stretches of home h's particles, in the order of their cells, that share
+  // a cell, fit into a packet and touch one of these of the 27 blocks.
+  template <typename F>
+  void for_each_cell(const HomePass<T>& pass, int64_t h, uint32_t blocks, const F& f) const {
+    const auto r = pass.range(h);
+    for (int64_t at = r.begin; at < r.end;) {
+      const uint32_t cell = s_.meta[s_.entry[at]] & 511u;
+      int64_t last = at + 1;
+      while (last < r.end && last < at + kLanes && (s_.meta[s_.entry[last]] & 511u) == cell) ++last;
+      if ((kReach.blocks[cell] & blocks) != 0) f(at, last);
+      at = last;
+    }
+  }
+  static uint32_t block_bit(int t) {  // of place t of the window
+    return 1u << ((window_block(t / (kWindowEdge * kWindowEdge)) * 3 +
+                   window_block(t / kWindowEdge % kWindowEdge)) *
+                      3 +
+                  window_block(t % kWindowEdge));
+  }
+
+  // What the lanes of a packet give, four numbers each; nothing where another law is.
+  void given(const Packet<T>& packet, int used, Quad<T>* out) const {
+    const auto column = [&](int c) {
+      return pack_of<T>([&](int lane) {
+        const int64_t row = s_.row_of(packet.meta[lane]);
+        return lane < used && s_.law[row] == kPhaseField ? s_.rows[row * kRowColumns + c] : T(0);
+      });
+    };
+    P volume, length;
+    if (alone_ && used == kLanes && packet.same_rows()) {
+      const T* row = s_.rows + int64_t(s_.row_of(packet.meta[0])) * kRowColumns;
+      volume = P(row[kStressColumn]), length = P(row[4]);
+    } else {
+      volume = column(kStressColumn), length = column(4);
+    }
+    P four[kDamageSums];
+    damage_given(volume, length * P(s_.inv_dx), packet.load1(s_.alpha), packet.load1(s_.peak),
+                 four);
+    transpose(four, out);
+  }
+
+  void scatter(const HomePass<T>& pass) {
     nodes_.assign(slots_.size() * kBlockNodes, Sums{});
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
-          Sums sums[kWindowNodes] = {};
-          for_particles(homes[i], [&](int64_t p) {
-            const uint32_t row = s_.row_of(s_.meta[p]);
-            if (s_.law[row] != kPhaseField) return;
-            double of[kDamageSums];
-            damage_given(s_.rows + int64_t(row) * kRowColumns, s_.alpha[p], s_.peak[p], s_.inv_dx,
-                         of);
-            const Sums given{of[0], of[1], of[2], of[3]};
-            for_rows(p, [&](int at, T across, const T* along) {
-              const Sums part = double(across) * given;
-              for (int k = 0; k < 3; ++k) sums[at + k] += double(along[k]) * part;
-            });
+          Sums sums[kWindowNodes];
+          uint32_t live = 0;  // blocks that take part
+          for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
+            std::fill_n(sums + t, run, Sums{});
+            if (row >= 0) live |= block_bit(t);
           });
-          const Window nodes = window(homes[i]);
-          for (int n = 0; n < kWindowNodes; ++n)
-            if (nodes.row[n] >= 0) nodes_[nodes.row[n]] += sums[n];
+          if (live == 0) continue;
+          for_each_cell(pass, homes[i], live,
+                        [&](int64_t at, int64_t last) { scatter_cell(at, last, sums); });
+          for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
+            for (int n = 0; row >= 0 && n < run; ++n) nodes_[row + n] += sums[t + n];
+          });
         }
       });
+  }
+  // Particles [at, last), all of one cell. In single precision two at once.
+  [[gnu::always_inline]] void scatter_cell(int64_t at, int64_t last, Sums* sums) const {
+    using Give = PacketMomentum<T>;
+    using Raw = typename P::Raw;
+    const Packet<T> packet(s_, s_.entry + at, last - at);
+    const int used = static_cast<int>(last - at);
+    P offset[3];
+    packet.load3(s_.offset, offset);
+    const Stencil<P> stencil = stencil_at(offset);
+    Quad<T> four[kLanes];
+    given(packet, used, four);
+    Sums* node = sums + window_node(packet.meta[0]);
+    for (int i = 0; i < 3; ++i, node += kWindowEdge * kWindowEdge) {
+      P w[9];
+      for (int n = 0; n < 9; ++n)
+        w[n] = stencil.w[0][i] * stencil.w[1][n / 3] * stencil.w[2][n % 3];
+      Raw sum[9] = {};
+      int lane = 0;
+      if constexpr (sizeof(T) == 4)
+        for (; lane < used; lane += 2) {  // what is beyond gives nothing
+          const Raw two = load_pack(reinterpret_cast<const T*>(four + lane)).v;
+          for (int n = 0; n < 9; ++n) sum[n] += Give::two_lanes(w[n], lane) * two;
+        }
+      for (; lane < used; ++lane)
+        for (int n = 0; n < 9; ++n) sum[n] += P(w[n][lane]).v * Give::one_lane(four[lane]);
+      for (int n = 0; n < 9; ++n)
+        node[n / 3 * kWindowEdge + n % 3] += Give::doubles(Give::both_lanes(sum[n]));
+    }
   }
 
   // Edges towards the six neighbours of every node, the right side, and the first guess.
   void prepare() {
     const int64_t count = static_cast<int64_t>(slots_.size());
-    edge_.assign(nodes_.size(), Edge{});
-    field_.assign(nodes_.size(), 0.0);
+    edge_.resize(nodes_.size());
+    field_.resize(nodes_.size());
     parallel_for(count, 1, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
-        const int32_t* coord = s_.slot_coord + 4 * int64_t(slots_[b]);
         int32_t face[6];  // slots beyond the faces
-        for (int f = 0; f < 6; ++f) face[f] = slot_around(coord, face_block(f));
+        for (int f = 0; f < 6; ++f)
+          face[f] = around_[kNeighbours * int64_t(slots_[b]) + face_block(f)];
         for (int local = 0; local < kBlockNodes; ++local) {
           const int64_t n = b * kBlockNodes + local;
           const Sums& node = nodes_[n];
@@ -187,6 +260,8 @@ class DamagePass {
             bool inside;
             const int there = face_node(local, f, inside);
             const int32_t slot = inside ? slots_[b] : face[f];
+            e.near[f] = 0;
+            e.weight[f] = 0.0;
             if (slot < 0) return 0.0;
             if (number_[slot] < 0) return node[kStiffSum];
             const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
@@ -219,43 +294,60 @@ class DamagePass {
       });
   }
 
-  void gather() {
+  void gather(const HomePass<T>& pass) {
     for (const std::vector<int32_t>& homes : homes_)
       parallel_for(static_cast<int64_t>(homes.size()), 1, [&](int64_t begin, int64_t end) {
         for (int64_t i = begin; i < end; ++i) {
-          const Window nodes = window(homes[i]);
-          T field[kWindowNodes], most(0);
-          for (int n = 0; n < kWindowNodes; ++n) {
-            field[n] = nodes.row[n] >= 0 ? T(field_[nodes.row[n]]) : T(0);
-            most = std::max(most, field[n]);
-          }
-          if (most == T(0)) continue;  // no point gets more than it has
-          for_particles(homes[i], [&](int64_t p) {
-            if (!is_phase(p)) return;
-            T found(0);
-            for_rows(p, [&](int at, T across, const T* along) {
-              const T* f = field + at;
-              found += across * (along[0] * f[0] + along[1] * f[1] + along[2] * f[2]);
-            });
-            s_.peak[p] = peak_after(s_.peak[p], found);
+          T field[kWindowNodes];
+          uint32_t live = 0;  // elsewhere no point gets more than it has
+          for_each_run(pass, homes[i], [&](int t, int64_t row, int run) {
+            T most(0);
+            for (int n = 0; n < run; ++n) {
+              field[t + n] = row >= 0 ? T(field_[row + n]) : T(0);
+              most = std::max(most, field[t + n]);
+            }
+            if (most > T(0)) live |= block_bit(t);
           });
+          if (live == 0) continue;
+          for_each_cell(pass, homes[i], live,
+                        [&](int64_t at, int64_t last) { gather_cell(at, last, field); });
         }
       });
   }
+  [[gnu::always_inline]] void gather_cell(int64_t at, int64_t last, const T* field) const {
+    const Packet<T> packet(s_, s_.entry + at, last - at);
+    P offset[3];
+    packet.load3(s_.offset, offset);
+    const Stencil<P> stencil = stencil_at(offset);
+    const T* first = field + window_node(packet.meta[0]);
+    P found(0);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const T* f = first + (i * kWindowEdge + j) * kWindowEdge;
+        found +=
+            stencil.w[0][i] * stencil.w[1][j] *
+            (stencil.w[2][0] * P(f[0]) + stencil.w[2][1] * P(f[1]) + stencil.w[2][2] * P(f[2]));
+      }
+    if (mask_bits(found > P(0)) == 0) return;
+    for (int lane = 0; lane < static_cast<int>(last - at); ++lane) {
+      const int64_t p = packet.index[lane];
+      if (alone_ || is_phase(p)) s_.peak[p] = peak_after(s_.peak[p], found[lane]);
+    }
+  }
 
   struct Edge {
-    double weight[6] = {}, right = 0.0, inverse = 0.0;
-    int32_t near[6] = {};
+    double weight[6], right, inverse;
+    int32_t near[6];
   };
 
   const SolverView<T>& s_;
-  bool at2_ = false;
+  bool at2_ = false, alone_ = true;  // alone: there is no other law
   double empty_ = 0.0;
-  T active_;  // alpha from which a point takes part
-  std::vector<uint64_t> keys_;
-  std::vector<int32_t> colors_[kColors], homes_[kColors];  // homes by colour; those that take part
-  std::vector<int32_t> number_;                            // [slots] row of an active slot, or -1
-  std::vector<int32_t> slots_;                             // active slots
+  T active_;                             // alpha from which a point takes part
+  std::vector<int32_t> around_;          // [slots, 27], or empty
+  std::vector<int32_t> homes_[kColors];  // homes that take part, by colour
+  std::vector<int32_t> number_;          // [slots] row of an active slot, or -1
+  std::vector<int32_t> slots_;           // active slots
   std::vector<Sums> nodes_;
   std::vector<Edge> edge_;
   std::vector<double> field_;

@@ -281,6 +281,7 @@ class HomePass {
   Counts from_nodes_more() const;
   Counts from_nodes_viscous(int laws) const;  // in solver_viscous.cpp
   friend class FlipPass<T>;                   // in cpu/mpm/flip.cpp, likewise
+  friend class DamagePass<T>;                 // in cpu/solver/damage.h
 
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;

@@ -262,7 +262,6 @@ struct PacketMomentum {
     }
   }
 
- private:
   using Raw = typename Pack<T>::Raw;
 
   // Nine nodes of one plane of the stencil: momentum q + j y + k z.

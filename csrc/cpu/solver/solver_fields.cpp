@@ -16,7 +16,7 @@ void FieldPass<T>::plan() {
 
 template <typename T>
 Counts FieldPass<T>::from_nodes(const HomePass<T>& homes) {
-  damage_->run();
+  damage_->run(homes);
   return homes.template from_nodes<kDamageField>();
 }
 

@@ -111,14 +111,16 @@ struct Solve {
     const int64_t count = min(int64_t(homes.count[home]), s.count - first);
     double per_unit[kDamageSums];
     for (int c = 0; c < kDamageSums; ++c) per_unit[c] = 1.0 / s.damage_scale[c];
-    for (int64_t r = threadIdx.x; first >= 0 && r < count; r += kDamageThreads) {
-      const int64_t p = first + r;
+    for (int64_t i = threadIdx.x; first >= 0 && i < count; i += kDamageThreads) {
+      const int64_t p = first + i;
       T offset[3];
       const uint32_t meta = load_place(s, p, offset);
       const uint32_t row = s.row_of(meta);
       if (s.law[row] != kPhaseField) continue;
       double given[kDamageSums];
-      damage_given(s.rows + int64_t(row) * kRowColumns, s.alpha[p], s.peak[p], s.inv_dx, given);
+      const T* r = s.rows + int64_t(row) * kRowColumns;
+      damage_given(double(r[kStressColumn]), double(r[4]) * double(s.inv_dx), double(s.alpha[p]),
+                   double(s.peak[p]), given);
       for (int c = 0; c < kDamageSums; ++c) given[c] *= per_unit[c];
       const Stencil<T> st = stencil_at(offset);
       const int base = window_base(meta);
