@@ -34,10 +34,10 @@ from gsfluent.scene.scene import Scene
 
 BETA = 3.5
 """Grains are as frequent as their size to the power of minus this, in solids."""
-GRAIN = 2.2e-3
+GRAIN = 1.4e-3
 """Smallest chip [m], whatever the grid; what is finer is mist. Where that is more than a point,
 only some of the points have one."""
-SHARE, LARGEST = 1.0 / 25.0, 1.0 / 8.0
+SHARE, LARGEST = 1.0 / 45.0, 1.0 / 8.0
 """Smallest chip, at most, and largest, as shares of the edge of a cube of the body's volume."""
 MIST = (0.1, 0.06)
 """Share of dust that is mist: of powder, of juice; a quarter of a melon's hid all of it."""
