@@ -79,7 +79,7 @@ def fit_to(
         seed: Of the starts, and of solids.
         jobs: Searches at a time.
         on: Where searches run, see :func:`gsfluent.sweep.map`.
-        device: Where solids are made; the searches are done on the CPU, in float64.
+        device: Where solids are made and the solver runs, in float64.
         reporter: Told of the progress.
 
     Returns:
@@ -114,8 +114,9 @@ def fit_to(
     base = fingerprint(shot.resolved(), list(learn), list(laws), kind, *digests, sigma, fps, seed)
     runner = functools.partial(_through_sweep, out / "search", base, jobs, on)
     stage = Fit(
-        list(learn), laws=laws, starts=starts, cells=cells, grids=grids, seed=seed, runner=runner
-    )
+        list(learn), laws=laws, starts=starts, cells=cells, grids=grids, seed=seed, runner=runner,
+        device=device,
+    )  # fmt: skip
     found = stage(scene, target, progress=reporter.task("fit"))
     values = {"target": kind, **found.report, "outputs": dict(FILES)}
     write_json(out / FILES["fit"], values)
@@ -141,7 +142,8 @@ def _through_sweep(
     """Do searches, each once; those of another shot or target have other names."""
     tasks = list(items)
     ids = [
-        fingerprint(base, t.start, t.dx, list(t.shares), t.grids, t.judge, t.name) for t in tasks
+        fingerprint(base, t.start, t.dx, list(t.shares), t.grids, t.judge, t.name, t.device)
+        for t in tasks
     ]
     unlike = dict(zip(ids, tasks, strict=True))
     outcomes = sweep_map(

@@ -71,13 +71,17 @@ class Forward:
         times: Of the frames [s], ascending from 0.
         dx: Grid spacing [m].
         seed: Of the point positions, as far as anything is random.
+        device: Where the solver runs; what it shows lies on the CPU.
 
     Raises:
         InputError: A body breaks, is a bullet or a liquid jet, or a collider is driven.
     """
 
-    def __init__(self, scene: Scene, times: list[float], dx: float, seed: int = 0) -> None:
-        self.scene, self.times, self.dx = scene, times, dx
+    def __init__(
+        self, scene: Scene, times: list[float], dx: float, seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
+        self.scene, self.times, self.dx, self.device = scene, times, dx, torch.device(device)
         self.runs = 0
         step = dx / POINTS_PER_CELL ** (1 / 3)
         self._bodies: list[dict[str, Any]] = []
@@ -183,15 +187,19 @@ class Forward:
         first = next((t for t in self.times if t > 0.0), dt)
         kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
         velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
-        body = self._fields()
+        body, there = self._fields(), self.device
+        moved = {k: v.to(there) for k, v in matter._asdict().items() if k != "copies"}
+        matter = matter._replace(**moved)
         solver = ops.Solver(
-            (position + lift).repeat(copies, 1), velocity.repeat(copies, 1), matter.mass,
-            matter.volume, dx=self.dx, law=matter.law, params=matter.params,
+            (position + lift).repeat(copies, 1).to(there), velocity.repeat(copies, 1).to(there),
+            matter.mass, matter.volume, dx=self.dx, law=matter.law, params=matter.params,
             material=matter.material, alpha=matter.alpha[matter.material.long()],
-            affine=affine.repeat(copies, 1, 1),
-            deformation=torch.eye(3, dtype=torch.float64).repeat(copies * self.count, 1, 1),
-            body=None if body is None else body.repeat(copies), gravity=self.scene.gravity,
-            colliders=rows if rows.shape[0] else None, sdf=self.rigid.sdf,
+            affine=affine.repeat(copies, 1, 1).to(there),
+            deformation=torch.eye(3, dtype=torch.float64).repeat(copies * self.count, 1, 1)
+            .to(there),
+            body=None if body is None else body.repeat(copies).to(there),
+            gravity=self.scene.gravity, colliders=rows.to(there) if rows.shape[0] else None,
+            sdf=None if self.rigid.sdf is None else self.rigid.sdf.to(there),
             friction=self.scene.friction, dt=dt,
         )  # fmt: skip
         shown: list[tuple[Tensor, ...]] = []
@@ -209,13 +217,13 @@ class Forward:
                 except (SolverError, ValueError) as error:
                     raise TooFast from error
                 now = time
-            place = solver.position[: self.count].double() - lift
+            place = solver.position[: self.count].double().cpu() - lift
             map = solver.deformation
             assert map is not None  # tracked from the start
             if not bool(torch.isfinite(place).all()):
                 raise TooFast
-            impulse = solver.impulse if rows.shape[0] else place.new_zeros(0, 3)
-            shown.append((place, map[: self.count].double().clone(), impulse))
+            impulse = solver.impulse.cpu() if rows.shape[0] else place.new_zeros(0, 3)
+            shown.append((place, map[: self.count].double().cpu().clone(), impulse))
         where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
         change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
         return Motion(where, maps, pushes, 0.5 * change.abs().amax())

@@ -179,6 +179,7 @@ def choose_laws(
     grids: int,
     offset: bool,
     runner: Runner,
+    device: str = "cpu",
     progress: Progress | None = None,
 ) -> Chosen:
     """Try every law for every object and part, one place after the other.
@@ -194,6 +195,7 @@ def choose_laws(
         grids: 1 or 2.
         offset: Learn the offset of the floor.
         runner: Does the searches of a place, all at once.
+        device: Where the solver runs.
         progress: Told after each place.
 
     Raises:
@@ -218,7 +220,7 @@ def choose_laws(
             label = repr(sorted(places(made).items()))
             for begin in unknowns.starts(starts, seed):
                 at = _kept(unknowns, begin, values, place)
-                one = Task(made, target, unknowns, at, dx, SEEN, grids, judge=True, name=label)
+                one = Task(made, target, unknowns, at, dx, SEEN, grids, True, label, device)
                 tasks.append((law, one))
         done = zip(tasks, runner(run_task, [task for _, task in tasks]), strict=True)
         best: dict[str, tuple[Task, dict[str, Any]]] = {}

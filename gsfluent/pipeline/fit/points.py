@@ -58,14 +58,16 @@ class Mixed(Forward):
         dx: Grid spacing [m].
         laws: At least two.
         nodes: Nodes along each axis.
+        device: Where the solver runs.
 
     Raises:
         InputError: Several objects, or parts.
     """
 
     def __init__(
-        self, scene: Scene, times: list[float], dx: float, laws: Sequence[str], nodes: int
-    ) -> None:
+        self, scene: Scene, times: list[float], dx: float, laws: Sequence[str], nodes: int,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
         if len(scene.bodies) != 1 or scene.bodies[0].parts:
             raise InputError(
                 "fit: laws per point are for one object without parts",
@@ -78,7 +80,7 @@ class Mixed(Forward):
         alone = Scene.__new__(Scene)
         alone.__dict__.update(scene.__dict__)
         alone.bodies = [plain]
-        super().__init__(alone, times, dx)
+        super().__init__(alone, times, dx, device=device)
         self.solid = not {LAWS[law] for law in laws} & {LAWS["fluid"], LAWS["drucker_prager"]}
         self.basis = corners(self.rest, self.rest, nodes)
         self._numbers = torch.tensor([LAWS[law] for law in laws], dtype=torch.int32)
@@ -155,6 +157,7 @@ class FieldTask:
         grids: 1 or 2.
         offset: Learn the offset of the floor.
         nodes: Along each axis.
+        device: Where the solver runs.
     """
 
     scene: Scene
@@ -165,6 +168,7 @@ class FieldTask:
     grids: int
     offset: bool
     nodes: int
+    device: str = "cpu"
 
 
 def run_field(task: FieldTask) -> dict[str, Any]:
@@ -175,7 +179,7 @@ def run_field(task: FieldTask) -> dict[str, Any]:
         TooFast: The start cannot be run.
     """
     times = list(task.target.times)
-    grids = [Mixed(task.scene, times, task.dx / RATIO**k, task.laws, task.nodes)
+    grids = [Mixed(task.scene, times, task.dx / RATIO**k, task.laws, task.nodes, task.device)
              for k in range(task.grids)]  # fmt: skip
     unknowns = _unknowns(task, grids[0])
     if len(unknowns) > MOST_NUMBERS:

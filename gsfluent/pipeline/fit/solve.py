@@ -64,6 +64,29 @@ class Fitted:
     strain: float
 
 
+@dataclasses.dataclass
+class Linear:
+    """A motion linearised.
+
+    Attributes:
+        dt: Time step of all runs about it [s].
+        motion: Its middle.
+        pairs: What the target keeps meanwhile.
+        residual: In ``scale`` standard deviations, [R].
+        frame: Of each residual, [R].
+        scale: What does not fit is noise of its size, so that outliers stay outliers; at least 1.
+        jacobian: Of the residuals by the free coordinates that may change, [R, P].
+    """
+
+    dt: float
+    motion: Motion
+    pairs: Any
+    residual: Array
+    frame: NDArray[np.int64]
+    scale: float
+    jacobian: Array
+
+
 class Problem:
     """A scene, a target and what is learnt.
 
@@ -183,18 +206,12 @@ def search(
     rows = np.flatnonzero(active)
     prior = 1.0 / unknowns.spread**2
     free, damping, runs = start.copy(), DAMPING[0], problem.forward.runs
-    scale = 1.0
     for round_ in range(rounds + 1):
-        dt, motion = run_at(problem, free, frames)
-        pairs = problem.observer.pair(motion)
-        residual, frame = problem.seen(motion, frames, pairs)
+        at = linearise(problem, free, frames, rows)
+        residual, scale, jacobian = at.residual, at.scale, at.jacobian
         if len(residual) == 0:
             break
-        # what does not fit is noise of its size, so that outliers stay outliers
-        scale = max(1.0, 1.4826 * float(np.median(np.abs(residual))))
-        residual = residual / scale
         here = cost_of(residual) + 0.5 * float((prior * (free - unknowns.start) ** 2).sum())
-        jacobian = _jacobian(problem, free, frames, dt, pairs, residual, rows, scale)
         weight = weights(residual)
         normal = (jacobian * weight[:, None]).T @ jacobian
         slope = jacobian.T @ (weight * residual) + (prior * (free - unknowns.start))[rows]
@@ -208,7 +225,8 @@ def search(
             trial = free.copy()
             trial[rows] += step
             try:
-                found = problem.seen(problem.motion(trial, frames, dt), frames, pairs)[0] / scale
+                moved_to = problem.motion(trial, frames, at.dt)
+                found = problem.seen(moved_to, frames, at.pairs)[0] / scale
                 there = cost_of(found)
                 there += 0.5 * float((prior * (trial - unknowns.start) ** 2).sum())
             except TooFast:
@@ -228,22 +246,48 @@ def search(
     if len(residual) == 0:
         size = len(unknowns)
         return Fitted(free, 0.0, 0.0, np.zeros((size, size)), np.diag(unknowns.spread**2), [],
-                      problem.forward.runs - runs, float(motion.strain))  # fmt: skip
+                      problem.forward.runs - runs, float(at.motion.strain))  # fmt: skip
     return Fitted(
         free=free,
         cost=here,
         rms=scale * float(np.sqrt(np.mean(residual**2))),
         information=_spread(normal, rows, len(unknowns)),
-        covariance=_covariance(jacobian, weight * residual, weight, frame, prior, rows),
+        covariance=_covariance(jacobian, weight * residual, weight, at.frame, prior, rows),
         per_frame=[
-            scale * float(np.sqrt(np.mean(residual[frame == k] ** 2)))
-            if (frame == k).any()
+            scale * float(np.sqrt(np.mean(residual[at.frame == k] ** 2)))
+            if (at.frame == k).any()
             else 0.0
             for k in range(frames)
         ],
         runs=problem.forward.runs - runs,
-        strain=float(motion.strain),
+        strain=float(at.motion.strain),
     )
+
+
+def linearise(
+    problem: Problem, free: Array, frames: int, rows: NDArray[np.int64] | None = None
+) -> Linear:
+    """Residuals and their Jacobian about these coordinates.
+
+    Args:
+        problem: What is searched.
+        free: Free coordinates.
+        frames: How many frames count.
+        rows: Coordinates that may change; all when None.
+
+    Raises:
+        TooFast: They cannot be run at any step tried.
+    """
+    rows = np.arange(len(problem.unknowns)) if rows is None else rows
+    dt, motion = run_at(problem, free, frames)
+    pairs = problem.observer.pair(motion)
+    residual, frame = problem.seen(motion, frames, pairs)
+    if len(residual) == 0:
+        return Linear(dt, motion, pairs, residual, frame, 1.0, np.zeros((0, len(rows))))
+    scale = max(1.0, 1.4826 * float(np.median(np.abs(residual))))
+    residual = residual / scale
+    jacobian = _jacobian(problem, free, frames, dt, pairs, residual, rows, scale)
+    return Linear(dt, motion, pairs, residual, frame, scale, jacobian)
 
 
 def run_at(problem: Problem, free: Array, frames: int) -> tuple[float, Motion]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gsfluent.errors import InputError, RunError
@@ -85,6 +85,7 @@ class Fit(Stage):
         offset: Learn how much higher than the floor the grid holds matter up, too.
         seed: Of the starts.
         runner: Does the searches; one after the other when absent.
+        device: Where the solver runs, in float64; pictures and algebra are done on the CPU.
 
     Raises:
         InputError: A number out of range, or an unknown law.
@@ -105,6 +106,7 @@ class Fit(Stage):
         offset: bool = True,
         seed: int = 0,
         runner: Runner = one_by_one,
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(seed=seed)
         for name, value, low, high in (
@@ -120,7 +122,7 @@ class Fit(Stage):
             )
         if not 2 <= nodes <= 8:
             raise InputError(f"fit: nodes is {nodes}", "give a number from 2 to 8")
-        self.offset, self.runner = offset, runner
+        self.offset, self.runner, self.device = offset, runner, str(torch.device(device))
 
     def forward(self, scene: Scene, target: Target, *, progress: Progress | None = None) -> Found:
         """Learn.
@@ -141,28 +143,30 @@ class Fit(Stage):
             chosen = choose_laws(
                 scene, target, self.learn, self.laws, starts=self.starts, seed=self.seed, dx=dx,
                 runner=self.runner, progress=progress, grids=self.grids, offset=self.offset,
+                device=self.device,
             )  # fmt: skip
-            task = Task(chosen.scene, target, chosen.unknowns, chosen.start, dx, SHARES, self.grids)
-            made = conclude(chosen.scene, chosen.unknowns, self._last([task]), [])
+            found = self._last(chosen.scene, target, chosen.unknowns, chosen.start, dx)
+            made = conclude(chosen.scene, chosen.unknowns, found, [])
             return dataclasses.replace(
                 made, laws=chosen.laws, report={**made.report, "laws": chosen.report}
             )
         unknowns = unknowns_of(scene, self.learn, grids=self.grids, offset=self.offset)
-        make = functools.partial(Task, scene, target, unknowns)
         total = 1 + (self.starts if self.starts > 1 else 0)
         begin, tries = unknowns.start.tolist(), list[dict[str, Any]]()
         if self.starts > 1:
             # of all starts two stages; the best goes on
             starts = unknowns.starts(self.starts, self.seed)
             tries = self.runner(
-                run_task, [make(s.tolist(), dx, SHARES[:2], self.grids) for s in starts]
-            )
+                run_task,
+                [Task(scene, target, unknowns, s.tolist(), dx, SHARES[:2], self.grids,
+                      device=self.device) for s in starts],
+            )  # fmt: skip
             report_progress(progress, self.starts, total, "starts")
             good = [t for t in tries if np.isfinite(t["cost"])]
             if not good:
                 raise RunError("fit: no start can be run", "nothing", "start from other numbers")
             begin = min(good, key=lambda t: t["cost"])["free"]
-        found = self._last([make(begin, dx, SHARES, self.grids)])
+        found = self._last(scene, target, unknowns, begin, dx)
         report_progress(progress, total, total, f"{self.cells} cells")
         return conclude(scene, unknowns, found, tries)
 
@@ -172,7 +176,7 @@ class Fit(Stage):
         """Where which law holds; then the numbers of the regions by a search of their own."""
         asked = flat(self.learn)
         field = FieldTask(
-            scene, target, self.laws, asked, dx, self.grids, self.offset, self.nodes
+            scene, target, self.laws, asked, dx, self.grids, self.offset, self.nodes, self.device
         )  # fmt: skip
         mixed = self.runner(run_field, [field])[0]
         report_progress(progress, 1, 2, "laws per point")
@@ -188,7 +192,7 @@ class Fit(Stage):
             if value is not None:
                 begin[part] = p.free(np.ravel(value).tolist())
         # moduli that were shared begin wrong: all frames at once would trade them for yield
-        found = self._last([Task(made, target, unknowns, begin.tolist(), dx, SHARES, self.grids)])
+        found = self._last(made, target, unknowns, begin.tolist(), dx)
         report_progress(progress, 2, 2, f"{self.cells} cells")
         solid = body.solid
         assert solid is not None and solid.regions is not None
@@ -199,9 +203,14 @@ class Fit(Stage):
         laws = {label: law for law, label in labels.items()}
         return dataclasses.replace(concluded, laws=laws, report=report)
 
-    def _last(self, tasks: list[Task]) -> dict[str, Any]:
+    def _last(
+        self, scene: Scene, target: Target, unknowns: Unknowns, begin: list[float], dx: float
+    ) -> dict[str, Any]:
         """The search that counts."""
-        found: dict[str, Any] = self.runner(run_task, tasks)[0]
+        task = Task(
+            scene, target, unknowns, begin, dx, SHARES, self.grids, device=self.device
+        )  # fmt: skip
+        found: dict[str, Any] = self.runner(run_task, [task])[0]
         if not np.isfinite(found["cost"]):
             raise RunError("fit: the best start cannot be run", "nothing", "use fewer cells")
         return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -42,6 +43,7 @@ class Task:
         grids: 1 or 2.
         judge: Search the last stage to its end, and see how well the frames after it are foretold.
         name: What tells it from searches of the same start.
+        device: Where the solver runs.
     """
 
     scene: Scene
@@ -53,13 +55,15 @@ class Task:
     grids: int = 1
     judge: bool = False
     name: str = ""
+    device: str = "cpu"
 
 
 def run_task(task: Task) -> dict[str, Any]:
     """Do one search; plain values come back."""
     times = list(task.target.times)
-    forward = Forward(task.scene, times, task.dx)
-    finer = Forward(task.scene, times, task.dx / RATIO) if task.grids == 2 else None
+    make = functools.partial(Forward, task.scene, times, device=task.device)
+    forward = make(task.dx)
+    finer = make(task.dx / RATIO) if task.grids == 2 else None
     observer = task.target.observe(forward.setting())
     problem = Problem(forward, observer, task.unknowns, task.target.step)
     try:

@@ -14,8 +14,10 @@ import argparse
 import dataclasses
 import json
 import math
+import os
+import sys
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,7 +30,9 @@ from gsfluent.data import SURFACE, Gaussians, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit, Simulate
-from gsfluent.pipeline.fit.task import RATIO
+from gsfluent.pipeline.fit.forward import Forward
+from gsfluent.pipeline.fit.solve import Problem, linearise
+from gsfluent.pipeline.fit.task import RATIO, Task, one_by_one
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 
@@ -151,7 +155,26 @@ def seen(
     return solid, velocity, true, np.stack([frame[rows] for frame in frames]), len(frames[0])
 
 
-def record(kind: str, number: int, cells: int) -> dict[str, Any]:
+def keep(task: Task, found: dict[str, Any], path: Path) -> None:
+    """Residuals and Jacobian where a search has ended, so that other bands may be tried on them."""
+    times = list(task.target.times)
+    forward = Forward(task.scene, times, task.dx)
+    problem = Problem(
+        forward, task.target.observe(forward.setting()), task.unknowns, task.target.step
+    )
+    free = np.asarray(found["free"])
+    problem.refine(Forward(task.scene, times, task.dx / RATIO), free, len(times))
+    here = linearise(problem, free, len(times))
+    np.savez_compressed(
+        path, labels=task.unknowns.labels(), free=free, start=task.unknowns.start,
+        spread=task.unknowns.spread, slope=task.unknowns.slope(free), trust=problem.trust,
+        residual=here.residual.astype(np.float32), jacobian=here.jacobian.astype(np.float32),
+        scale=here.scale, frame=here.frame.astype(np.int16),
+        covariance=np.asarray(found["covariance"]),
+    )  # fmt: skip
+
+
+def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict[str, Any]:
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
     here = KINDS[kind]
@@ -161,8 +184,19 @@ def record(kind: str, number: int, cells: int) -> dict[str, Any]:
     middle = clock.process_time()
     guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))
     learn = [f"it.{name}" for name in (*true, "velocity")]
-    fit = Fit(learn, starts=1, cells=cells)
+    searches: list[tuple[Task, dict[str, Any]]] = []
+
+    def runner(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        tasks = list(items)
+        done = one_by_one(function, tasks)
+        searches.extend(zip(tasks, done, strict=True))
+        return done
+
+    fit = Fit(learn, starts=1, cells=cells, runner=runner)
     found = fit(guess, Points(tracks, fps=FPS))
+    end = clock.process_time()
+    if kept is not None:
+        keep(*searches[-1], kept / f"{kind}_{number}.npz")
     errors = []
     for key, learnt in found.report["parameters"].items():
         name = key.partition(".")[2]
@@ -182,7 +216,7 @@ def record(kind: str, number: int, cells: int) -> dict[str, Any]:
         "grid": {k: found.values[k] for k in ("floor.offset", "grid.extrapolation")},
         "runs": [g["runs"] for g in found.report["grids"]],
         "points": [g["points"] for g in found.report["grids"]],
-        "truth_seconds": middle - begun, "fit_seconds": clock.process_time() - middle,
+        "truth_seconds": middle - begun, "fit_seconds": end - middle,
     }  # fmt: skip
 
 
@@ -234,12 +268,19 @@ def in_pool(
     jobs: int,
     minutes: float,
 ) -> list[dict[str, Any]]:
-    """Call a function with each of the tasks, and add what comes to a file, until time is up."""
+    """Call a function with each of the tasks, and add what comes to a file, until time is up.
+
+    A process has one thread. What fails is told, and the others go on.
+    """
     end, records = clock.monotonic() + 60.0 * minutes, []
+    os.environ.update({f"{kind}_NUM_THREADS": "1" for kind in ("OMP", "MKL", "OPENBLAS")})
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        calls = [pool.submit(function, *task) for task in tasks]
+        calls = {pool.submit(function, *task): task for task in tasks}
         try:
             for call in as_completed(calls, timeout=max(end - clock.monotonic(), 0.0)):
+                if (error := call.exception()) is not None:
+                    print(f"{calls[call]}: {error!r}", file=sys.stderr, flush=True)
+                    continue
                 records.append(call.result())
                 with path.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(records[-1]) + "\n")
@@ -261,13 +302,17 @@ def main() -> None:
         "--minutes", type=float, default=1e6, help="what is not done by then is left"
     )
     parser.add_argument("--out", type=Path, default=DATA / "fit_tracks.jsonl")
+    parser.add_argument("--keep", type=Path, help="folder for residuals and Jacobians of scenes")
     parser.add_argument("--markdown", type=Path, default=PAGE)
     options = parser.parse_args()
     path: Path = options.out
+    if options.keep is not None:
+        options.keep.mkdir(parents=True, exist_ok=True)
     records = read(path)
     done = {(r["kind"], r["scene"]) for r in records}
-    wanted = [(k, n) for n in range(options.scenes) for k in options.only if (k, n) not in done]
-    tasks = [(kind, number, options.cells) for kind, number in wanted]
+    slow_first = [(k, n) for n in range(options.scenes) for k in reversed(options.only)]
+    wanted = [pair for pair in slow_first if pair not in done]
+    tasks = [(kind, number, options.cells, options.keep) for kind, number in wanted]
     records += in_pool(record, tasks, path, options.jobs, options.minutes)
     if records:
         page: Path = options.markdown

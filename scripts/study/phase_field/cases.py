@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from struck import kalthoff
 
 from gsfluent import ops
-from gsfluent.fracturebench.registry import find, judge
+from gsfluent.fracturebench.registry import judge
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.scenes import cracks
@@ -155,18 +156,6 @@ def pmma(release: float, dx: float, device: str) -> Done:
     return {"release": release, "share": share.value, "speed": speed.value}, scene, run
 
 
-def kalthoff(cells: int, split: str, device: str) -> Done:
-    """Kalthoff and Winkler's plate with the toughness of its phase-field papers, 22 130 J/m^2."""
-    plain = find("kalthoff").build(0.1 / cells, 8)
-    steel = plain.materials[1] | {
-        "fracture_energy": 22130.0, "split": split, "length": 2.0 * plain.dx,
-    }  # fmt: skip
-    scene = dataclasses.replace(plain, materials=(plain.materials[0], steel))
-    run = _run(scene, device)
-    angle, length = judge(scene, run)
-    return {"angle": angle.value, "length": length.value}, scene, run
-
-
 # --- three-point bending ---
 
 
@@ -268,10 +257,13 @@ def jobs(quick: bool, device: str) -> list[Job]:
                 "pmma", f"{2e3 * dx:g}_{release:g}", f"{2e3 * dx:g} mm", cost,
                 lambda r=release, d=dx: pmma(r, d, device),
             )  # fmt: skip
-    for split in ("spectral", "volumetric"):
-        for count in (48,) if quick else (64, 128, 192):
+    # side in cells, l in thousandths of the side
+    plates = [(64, 31.25), (128, 31.25), (128, 15.625), (256, 15.625), (256, 7.8125)]
+    for count, length in plates[:1] if quick else [*plates, (512, 7.8125)]:
+        for split, model in (("spectral", "at1"), ("spectral", "at2"), ("volumetric", "at1")):
             add(
-                "kalthoff", f"{count}_{split}", f"{count} cells, {split}", (count / 32.0) ** 3,
-                lambda c=count, s=split: kalthoff(c, s, device),
+                "kalthoff", f"{count}_{length:g}_{split}_{model}",
+                f"{count} cells, {0.1 * length:.2g} mm, {split}, {model}", (count / 32.0) ** 3,
+                lambda c=count, w=length, s=split, m=model: kalthoff(c, s, m, 1e-4 * w, device),
             )  # fmt: skip
     return made

@@ -130,9 +130,18 @@ def pmma(found: Sequence[Found]) -> str:
 def kalthoff(found: Sequence[Found]) -> str:
     """Direction of Kalthoff's crack."""
     rows = (
-        (f["setting"], f"{f['angle']:.1f}", f"{f['length']:.1f}", f"{f['wall']:.0f}") for f in found
-    )
-    return _table(("side, split", "direction [degrees]", "length [mm]", "s"), rows)
+        (
+            f["setting"], f"{f['angle']:.1f}", f"{f['median']:.1f}", f"{f['length']:.0f}",
+            f"{f['when']:.0f}", f"{f['wall']:.0f}",
+        )
+        for f in sorted(found, key=lambda f: (f["split"], f["model"], int(f["points"])))
+        if f["length"]
+    )  # fmt: skip
+    head = (
+        "side, l, split, model", "direction of the end [degrees]", "along the path",
+        "length [mm]", "broken from [us]", "s",
+    )  # fmt: skip
+    return _table(head, rows)
 
 
 def cost(found: Sequence[Found]) -> str:

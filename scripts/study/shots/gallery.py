@@ -81,12 +81,12 @@ def machine(device: torch.device) -> str:
     return f"{processor()}, {len(os.sched_getaffinity(0))} cores"
 
 
-def shot_of(name: str, quality: str | None) -> Shot:
+def shot_of(name: str, quality: str | None, device: torch.device | str = "cpu") -> Shot:
     """The shot of a scene, its photographs drawn where it needs them."""
     drawn = SCENES[name].drawn
     if drawn and not (EXAMPLES / "data" / drawn / "cut.png").is_file():
         logging.info("photographing %s", drawn)
-        photograph_demo(drawn, EXAMPLES / "data" / drawn, SIZES["full"])
+        photograph_demo(drawn, EXAMPLES / "data" / drawn, SIZES["full"], device=device)
     shot = load_shot(EXAMPLES / f"{name}.yaml")
     if quality is None:
         return shot
@@ -95,7 +95,7 @@ def shot_of(name: str, quality: str | None) -> Shot:
 
 def run(name: str, options: argparse.Namespace, device: torch.device) -> dict[str, Any]:
     """Run one scene; return its line for gallery.jsonl."""
-    shot = shot_of(name, options.quality)
+    shot = shot_of(name, options.quality, device)
     out = options.out / name
     start = time.perf_counter()
     record = run_shot(
