@@ -208,8 +208,12 @@ GSF_HOST_DEVICE void density_normal(const DensityNormalArgs<T>& a, int64_t i) {
   }
   if (a.eye) {
     const Vec3<T> view{a.eye[0] - p[0], a.eye[1] - p[1], a.eye[2] - p[2]};
-    // Seen edge on, the eye tells no side, and another one for every splat.
-    if (dot(out, view) < T(kDensityAway) * norm(out) * norm(view)) out = T(-1) * out;
+    // Seen edge on, the eye tells no side, and another one for every splat. Nor does it of what
+    // both gradients are sure of: that sticks out over an outline, and turned it would be in the
+    // dark.
+    const bool sure =
+        dot(out, wide) > T(0) && norm(wide) > T(kDensityClear) && norm(out) > T(kDensitySure);
+    if (!sure && dot(out, view) < T(kDensityAway) * norm(out) * norm(view)) out = T(-1) * out;
   }
   for (int c = 0; c < 3; ++c) a.normals[3 * i + c] = out[c];
 }

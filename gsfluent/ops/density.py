@@ -104,7 +104,8 @@ def density_normals(
         values: What :func:`occupancy` gave.
         frame: As there.
         nodes: As there.
-        eye: Where the picture is taken from [m], shape [3]: what looks away from it is turned. A
+        eye: Where the picture is taken from [m], shape [3]: what looks away from it is turned,
+            unless both the fine and the coarse gradient are sure of a solid's side. A
             shell has no side to the density, and is seen from outside or from inside.
 
     Returns:

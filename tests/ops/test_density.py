@@ -124,6 +124,28 @@ def test_normals_of_a_ball_point_outward() -> None:
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_the_far_side_of_a_solid_stays_there(device: str) -> None:
+    """Turned to the eye it would be black wherever a splat sticks out over an outline. A sheet has
+    no such side: one sees it from within."""
+    means, quats, scales = splats(60000)
+    skin = (means.norm(dim=1) > 0.93) & (means.norm(dim=1) < 1.01) & (scales[:, 1] > 0.01)
+    eye = torch.tensor([4.0, 0.0, 0.0], dtype=torch.float64)
+    outward = means[skin] / means[skin].norm(dim=1, keepdim=True)
+    far = ((eye - means[skin]) * outward).sum(dim=1) < 0.0
+    full = 0.8 * 60000 / (4.19 / 0.09**3)
+
+    def turned(kept: torch.Tensor) -> float:
+        """Of the skin's far side, how much is turned to the eye."""
+        values = occupancy(means[kept], frame(), NODES, full=full)
+        given = [t.to(device) for t in (means[skin], quats[skin], scales[skin], values, frame())]
+        seen = density_normals(*given, NODES, eye=eye.to(device)).cpu()
+        return float(((seen * outward).sum(dim=1) < 0.0)[far].double().mean())
+
+    assert turned(torch.ones_like(skin)) < 0.02
+    assert turned(means.norm(dim=1) > 0.93) > 0.2
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_a_sheet_seen_edge_on_has_one_side(device: str) -> None:
     """A rough film on something, seen along it: no splat of it may face down, unlit."""
     g = torch.Generator().manual_seed(5)

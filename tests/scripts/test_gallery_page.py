@@ -21,7 +21,8 @@ gallery = load_script("study/shots/gallery")
 def line(**keys: Any) -> dict[str, Any]:
     made = {
         "scene": "cake_cut", "machine": "Some CPU, 2 cores", "device": "cpu", "quality": "preview",
-        "verdict": "clean", "pieces": 2, "stages": {"fill": 3.4, "simulate": 20.2, "export": 0.2},
+        "verdict": "clean", "pieces": 2, "particles": 12_400, "hole_fraction": 0.00123,
+        "stages": {"fill": 3.4, "simulate": 20.2, "export": 0.2},
     }  # fmt: skip
     return made | keys
 
@@ -56,15 +57,37 @@ def test_every_scene_has_a_shot_that_reads(
 
 def test_the_table_has_the_recorded_times_and_the_machine() -> None:
     later = line(stages={"fill": 1.0, "simulate": 5.0})
-    gpu = line(device="cuda", machine="Some GPU", quality="shot", pieces=7, verdict="healed")
+    gpu = line(device="cuda", machine="NVIDIA X1", quality="shot", pieces=7, verdict="healed")
     text = gallery.table([line(), later, gpu])
     row = next(r for r in text.splitlines() if "cake_cut.yaml" in r)
     assert "6 s (fill 1, simulate 5; preview)" in row  # the last line counts
-    assert "24 s (fill 3, simulate 20; shot)" in row
-    assert "| healed | 7 |" in row
-    assert "2 cores: Some CPU, 2 cores." in text and "H100: Some GPU." in text
+    assert "24 s (fill 3, simulate 20; shot, X1)" in row
+    assert "| healed | 7 | 12 k | 0.12 % |" in row
+    assert "2 cores: Some CPU, 2 cores." in text and "GPU: NVIDIA X1." in text
     empty = next(r for r in text.splitlines() if "milk_poured.yaml" in r)
-    assert empty.endswith("| - | - | - | - |")
+    assert empty.endswith("| - | - | - | - | - | - |")
+
+
+def test_two_that_photograph_at_once_leave_one_whole_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what a run that was cut short has left makes room."""
+
+    def drawn(mine: str, meanwhile: bool) -> Any:
+        def draw(name: str, folder: Path, *_: Any, **__: Any) -> None:
+            (folder / "photographs").mkdir(parents=True)
+            (folder / "cut.png").write_text(mine)
+            if meanwhile:
+                monkeypatch.setattr(gallery, "photograph_demo", drawn("quicker", False))
+                gallery.photograph(name, tmp_path / "data" / name, "cpu")
+
+        return draw
+
+    (tmp_path / "data" / "orange" / "photographs").mkdir(parents=True)
+    monkeypatch.setattr(gallery, "photograph_demo", drawn("slower", True))
+    gallery.photograph("orange", tmp_path / "data" / "orange", "cpu")
+    assert (tmp_path / "data" / "orange" / "cut.png").read_text() == "quicker"
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["orange"]
 
 
 def test_a_strip_shows_the_moments_of_a_video(tmp_path: Path) -> None:

@@ -115,6 +115,9 @@ def density_normals(
     outward = torch.where(alone[:, None], own, outward)
     if eye is None:
         return outward
+    # what both gradients are sure of is seen from behind where it sticks out over an outline
+    sure = ((outward * wide).sum(-1) > 0) & (wide.norm(dim=-1) > CLEAR)
+    sure &= outward.norm(dim=-1) > SURE
     view = eye - means
     least = AWAY * outward.norm(dim=-1) * view.norm(dim=-1)
-    return torch.where(((outward * view).sum(-1) < least)[:, None], -outward, outward)
+    return torch.where((~sure & ((outward * view).sum(-1) < least))[:, None], -outward, outward)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsfluent.data import SURFACE, Gaussians, Particles
+from gsfluent.data import SPRAY, SURFACE, Gaussians, Particles
 from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.colliders.patches import FINEST, Patches, rectangle
 from gsfluent.pipeline.colliders.rigid import RigidSet
-from gsfluent.pipeline.liquid.sheet import CLOSED, ellipsoids
+from gsfluent.pipeline.liquid.sheet import CLOSED, TENSION, ellipsoids
 from gsfluent.scene.scene import Scene
 
 _STEEL = (0.40, 0.41, 0.43)
 _OPAQUE = 0.95
+_ALONE = 0.75
+"""Size of a drop without neighbours over that of a point of a liquid, up to which it is one."""
 _BLADE = (0.55, 0.57, 0.60)
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
@@ -47,7 +49,10 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
             made = _splats(drawn.means, drawn.scales, paint)
             share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
             opacities = torch.full_like(made.opacities, share)
-            groups.append(made.replace(quats=drawn.quats, opacities=opacities))
+            alone = drawn.scales[:, 0] < _ALONE * CLOSED * volume.pow(1.0 / 3.0)
+            mist = alone & (volume < TENSION**3)
+            labels = torch.where(mist, SPRAY, SURFACE).to(torch.int32)
+            groups.append(made.replace(quats=drawn.quats, opacities=opacities, labels=labels))
         else:
             groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None

@@ -34,10 +34,10 @@ from gsfluent.scene.scene import Scene
 
 BETA = 3.5
 """Grains are as frequent as their size to the power of minus this, in solids."""
-GRAIN = 2.2e-3
+GRAIN = 1.4e-3
 """Smallest chip [m], whatever the grid; what is finer is mist. Where that is more than a point,
 only some of the points have one."""
-SHARE, LARGEST = 1.0 / 25.0, 1.0 / 8.0
+SHARE, LARGEST = 1.0 / 45.0, 1.0 / 8.0
 """Smallest chip, at most, and largest, as shares of the edge of a cube of the body's volume."""
 MIST = (0.1, 0.06)
 """Share of dust that is mist: of powder, of juice; a quarter of a melon's hid all of it."""
@@ -61,14 +61,19 @@ LAG = 0.4
 BEGINS, FULL = 0.5, 1.5
 """Way from its chunk [edges of a point] at which a point begins to be drawn as dust, and is all."""
 OPACITY = 0.97
-SIDES = 6
-"""Sides of a chip, a splat each."""
-SIGMA, THIN = 0.6, 0.08
-"""Standard deviations of the splat of a side, along it in halves of the side, and across it."""
-FLAT = ((0.55, 1.0), (0.3, 0.7))
+SPLATS, FEWEST, MANY = 140.0, 12, 160
+"""Splats of the largest chip, which go as the power 1.5 of the size; fewest and most: as a picture
+of the body sees chips. Six, a side each, were scraps of paper, with soft edges and no body."""
+SPREAD, THIN = 0.47, 0.22
+"""Standard deviations of such a splat: along its side over the edge of its share of it, and across
+it over the shorter of these."""
+FLAT = ((0.6, 1.0), (0.45, 0.8))
 """Second and third edge of a chip over its first, from and to."""
-TILT = 0.35
-"""By how much the normals of its sides are tilted, as the tangent along each axis, at most."""
+TILT, UNEVEN = 0.35, 0.25
+"""By how much the normals of its sides are tilted, as the tangent along each axis, and by how much
+of their distance sides are moved in or out, at most."""
+ROUGH, RUGGED = 0.1, 0.45
+"""By how much of it a splat is moved in or out, and its normal tilted, at most: sides are torn."""
 TUMBLE = 0.5
 """Turn of a chip [rad] on a way as long as it is large, at most."""
 DEEP = 0.75
@@ -83,8 +88,16 @@ JUICE = 0.85
 STILL = 1e-3
 """A point that has gone less than this since the last frame [edges] lies still."""
 _ASKED = 4096  # points of a body that are asked for its mean colour, about
-_ROOM = 1 << 10  # numbers of grains for each point
-_AT_ONCE = (_ROOM - 1) // SIDES  # chips of a point, at most
+_CORNER = 3.0**-0.5
+_PLANES = (
+    (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0),
+    (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0),
+    (_CORNER, _CORNER, _CORNER), (_CORNER, -_CORNER, -_CORNER),
+    (-_CORNER, _CORNER, -_CORNER), (-_CORNER, -_CORNER, _CORNER),
+)  # fmt: skip
+_FINE = 2.0**40  # of a sum in whole numbers
+_ROOM = 1 << 14  # numbers of grains for each point
+_AT_ONCE = (_ROOM - 1) // MANY  # chips of a point, at most
 
 
 class Dust:
@@ -221,7 +234,7 @@ class Dust:
 
 
 class Grains:
-    """Splats of the grains of some points of one body: sides of chips, or puffs of mist.
+    """Splats of the grains of some points of one body: of the sides of chips, or puffs of mist.
 
     Args:
         row: Point of each, int64 [G].
@@ -231,9 +244,9 @@ class Grains:
         toward: Where that scatters to, of a length up to 1, [G, 3].
         lag: How far it stays behind, 0 to 1, [G].
         wet: Whether it darkens what it lands on, bool [G].
-        arm: Place of a side from the middle of its chip [m], [G, 3].
+        arm: Place of a splat from the middle of its chip [m], [G, 3].
         frame: Orientation of the chip, [G, 4].
-        half: Halves of its edges [m], [G, 3]; 0 for mist.
+        half: How far that reaches along its own axes [m], [G, 3]; 0 for mist.
         spin: Axis that it turns about times the turn on its way [rad/m], [G, 3].
         quats: Orientations, [G, 4].
         scales: Standard deviations [m], [G, 3].
@@ -305,7 +318,12 @@ class Grains:
             film = torch.lerp(scales[:, 2], torch.minimum(FILM * size, scales[:, 2]), lies)
             scales[:, 2] = torch.where(puff, film, scales[:, 2])
             color = color * (1.0 - (1.0 - DEEP) * lies * self.wet[some])[:, None]
-            up = (geometry.quaternion_to_matrix(frame)[:, 2].abs() * half).sum(dim=1)
+            # and on its broad side
+            level = _turned(lies[:, None] * _toppled(frame, half))
+            turn, frame, quats = (
+                geometry.quaternion_multiply(level, q) for q in (turn, frame, quats)
+            )
+            up = (geometry.quaternion_to_matrix(frame)[:, 2] * half).norm(dim=1)
             down = floor + torch.where(puff, 2.0 * scales[:, 2], up) - (here + off)[:, 2]
             off[:, 2] += lies * down
         arm = geometry.quaternion_to_matrix(turn) @ self.arm[some][..., None]
@@ -329,6 +347,17 @@ def _turned(vector: Tensor) -> Tensor:
     angle = vector.norm(dim=1, keepdim=True)
     axis = vector / angle.clamp(min=1e-12)
     return torch.cat([(0.5 * angle).cos(), (0.5 * angle).sin() * axis], dim=1)
+
+
+def _toppled(frame: Tensor, half: Tensor) -> Tensor:
+    """Rotation vectors [rad], [G, 3], that turn the shortest axes of chips upright; 0 for mist."""
+    short = half.argmin(dim=1)[:, None, None].expand(-1, 3, 1)
+    axis = geometry.quaternion_to_matrix(frame).gather(2, short)[..., 0]
+    axis = axis * torch.where(axis[:, 2:] < 0.0, -1.0, 1.0)
+    across = torch.stack([axis[:, 1], -axis[:, 0], torch.zeros_like(axis[:, 0])], dim=1)
+    length = across.norm(dim=1, keepdim=True)
+    turn = across * (torch.atan2(length, axis[:, 2:]) / length.clamp(min=1e-9))
+    return torch.where(half[:, :1] > 0.0, turn, torch.zeros_like(turn))
 
 
 def grains(
@@ -357,7 +386,7 @@ def grains(
     # one size in each of as many strata, so that every point has some of all
     drawn = (number + 0.5 + 0.5 * hashed(seed, 0)) / count.repeat_interleave(count)
     size = size * quantile(drawn, least, most)
-    chips = _chips(row, number, seed, size, edge.double().repeat_interleave(count))
+    chips = _chips(row, seed, size, edge.double().repeat_interleave(count), most)
     toward, offset = _thrown(own, edge.double())
     none, still = torch.zeros_like(offset), offset.new_tensor([1.0, 0.0, 0.0, 0.0])
     still = still.expand(len(rows), 4)
@@ -383,48 +412,98 @@ def _thrown(seed: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
     return out, 0.5 * hashes(seed, range(4, 7)) * edge[:, None]
 
 
-def _chips(row: Tensor, number: Tensor, seed: Tensor, size: Tensor, edge: Tensor) -> list[Tensor]:
-    """The sides of chips of some sizes [m], float64 [C], as :class:`Grains` takes them."""
+def _chips(row: Tensor, seed: Tensor, size: Tensor, edge: Tensor, most: float) -> list[Tensor]:
+    """Surfaces of chips of some sizes [m], float64 [C], as :class:`Grains` takes them.
+
+    A chip is what lies between planes: the sides of a box and its corners, some of them cut off,
+    all tilted and shifted; and its sides are rough. Its splats look all ways evenly, and each lies
+    in the plane that is met first that way. All of it is stretched to three unlike edges.
+    """
     toward, offset = _thrown(seed, edge)
     draw = 0.5 + 0.5 * hashes(seed, range(7, 9))
     low, high = draw.new_tensor(FLAT).unbind(dim=1)
     half = torch.cat([torch.ones_like(draw[:, :1]), low + draw * (high - low)], dim=1)
-    half = half * (math.pi / 6.0 / geometry.product(half)[:, None]).pow(1.0 / 3.0)
-    half = 0.5 * half * size[:, None]
+    half = half * geometry.product(half)[:, None].pow(-1.0 / 3.0)
     frame = torch.nn.functional.normalize(hashes(seed, range(9, 13)) + 1e-6, dim=1)
     lag = (0.5 + 0.5 * hashed(seed, 14)) * (1.0 - (size / (2.0 * edge)).clamp(max=1.0))
     spin = TUMBLE * hashes(seed, range(15, 18)) / size[:, None]
-    # each side lies across an axis, at one end of it
-    axis = torch.arange(SIDES, device=row.device) // 2
-    end = 1.0 - 2.0 * (torch.arange(SIDES, device=row.device) % 2)
-    across, along = (
-        torch.eye(3, dtype=half.dtype, device=row.device)[(axis + k) % 3] for k in range(2)
+    planes = torch.tensor(_PLANES, dtype=torch.float64, device=row.device)
+    normal = planes + TILT * hashes(seed, range(20, 20 + planes.numel())).view(-1, *planes.shape)
+    normal = torch.nn.functional.normalize(normal, dim=2)
+    reach = 1.0 + UNEVEN * hashes(seed, range(64, 64 + len(planes)))
+    count = splats_of(size / (most * edge))
+    chip = torch.arange(len(row), device=row.device).repeat_interleave(count)
+    which = torch.arange(len(chip), device=row.device)
+    which = which - (count.cumsum(0) - count)[chip]
+    way = _spiral(which, count[chip])
+    met = torch.full_like(way[:, 0], math.inf)
+    flat = way.clone()
+    for plane in range(len(planes)):  # one after the other: a chip has ten, and many splats
+        along = (way * normal[chip, plane]).sum(dim=1)
+        far = torch.where(along > 1e-3, reach[chip, plane] / along.clamp(min=1e-3), math.inf)
+        flat = torch.where((far < met)[:, None], normal[chip, plane], flat)
+        met = torch.minimum(met, far)
+    own = (seed[chip] ^ ((which * 0xC2B2AE35) & 0xFFFFFFFF)) & 0xFFFFFFFF
+    met = met * (1.0 + ROUGH * hashed(own, 80))
+    flat = torch.nn.functional.normalize(flat + RUGGED * hashes(own, range(81, 84)), dim=1)
+    # between splats that look all ways evenly there is the same volume
+    cubes = (met.pow(3) * _FINE).round().long()  # whole numbers, whose sum has no order
+    cubes = torch.zeros_like(row).index_add_(0, chip, cubes).double() / (_FINE * count)
+    size_of = 0.5 * size / cubes.pow(1.0 / 3.0)
+    half = half * size_of[:, None]
+    stretch = half[chip]
+    arm = stretch * way * met[:, None]
+    # a disc in the plane becomes an ellipse in the stretched one
+    first, second = (stretch * axis for axis in _across(flat))
+    turn = torch.atan2(
+        2.0 * (first * second).sum(dim=1), first.square().sum(dim=1) - second.square().sum(dim=1)
     )
-    place = end[:, None] * across * half[:, None]
-    tilt = TILT * hashes(seed, range(20, 20 + 3 * SIDES)).view(-1, SIDES, 3)
-    normal = torch.nn.functional.normalize(end[:, None] * across + tilt, dim=2)
-    first = along - normal * (normal * along).sum(dim=2, keepdim=True)
-    first = torch.nn.functional.normalize(first, dim=2)
-    second = torch.linalg.cross(normal, first)
-    local = geometry.matrix_to_quaternion(
-        torch.stack([first, second, normal], dim=3).view(-1, 3, 3)
+    c, s = (0.5 * turn).cos()[:, None], (0.5 * turn).sin()[:, None]
+    first, second = c * first + s * second, c * second - s * first
+    long, wide = first.norm(dim=1), second.norm(dim=1)
+    axes = torch.stack([first / long[:, None], second / wide[:, None]], dim=2)
+    third = torch.linalg.cross(axes[..., 0], axes[..., 1])
+    third = third * torch.where((third * arm).sum(dim=1) < 0.0, -1.0, 1.0)[:, None]
+    axes = torch.stack([torch.linalg.cross(axes[..., 1], third), axes[..., 1], third], dim=2)
+    spread = SPREAD * met * (4.0 * math.pi / count[chip]).sqrt()
+    long, wide = spread * long, spread * wide
+    scales = torch.stack([long, wide, THIN * torch.minimum(long, wide)], dim=1)
+    turned = geometry.quaternion_to_matrix(frame)[chip]
+    # how far a chip reaches along its own axes, by which it lies on the floor
+    reaches = half.new_zeros(half.shape).scatter_reduce_(
+        0, chip[:, None].expand(-1, 3), arm.abs(), "amax"
     )
-    wide = half[:, (axis + 1) % 3], half[:, (axis + 2) % 3]
-    thin = THIN * half.amin(dim=1, keepdim=True).expand(-1, SIDES)
-    scales = torch.stack([SIGMA * wide[0], SIGMA * wide[1], thin], dim=2)
-
-    def each(value: Tensor) -> Tensor:
-        return value.repeat_interleave(SIDES, dim=0)
-
-    arm = geometry.quaternion_to_matrix(frame)[:, None] @ place[..., None]
-    numbers = each(SIDES * number) + torch.arange(SIDES, device=row.device).repeat(len(row))
+    # grains of a point are numbered one after the other
+    _, many = torch.unique_consecutive(row[chip], return_counts=True)
+    numbers = torch.arange(len(chip), device=row.device)
+    numbers = numbers - (many.cumsum(0) - many).repeat_interleave(many)
     made = [
-        each(offset), each(toward), each(lag), torch.zeros_like(numbers, dtype=torch.bool),
-        arm.reshape(-1, 3), each(frame), each(half), each(spin),
-        geometry.quaternion_multiply(each(frame), local), scales.view(-1, 3),
+        offset[chip], toward[chip], lag[chip], torch.zeros_like(chip, dtype=torch.bool),
+        (turned @ arm[..., None])[..., 0], frame[chip], reaches[chip], spin[chip],
+        geometry.quaternion_multiply(frame[chip], geometry.matrix_to_quaternion(axes)), scales,
     ]  # fmt: skip
-    amount = each(math.pi / 6.0 / SIDES * size.pow(3))
-    return [each(row), numbers, amount, *(_single(value) for value in made)]
+    amount = (math.pi / 6.0 * size.pow(3) / count)[chip]
+    return [row[chip], numbers, amount, *(_single(value) for value in made)]
+
+
+def splats_of(size: Tensor) -> Tensor:
+    """Splats of chips, int64 [C], by their sizes over that of the largest, [C]."""
+    return (SPLATS * size.pow(1.5)).round().long().clamp(FEWEST, MANY)
+
+
+def _spiral(which: Tensor, count: Tensor) -> Tensor:
+    """Directions [M, 3] that lie evenly on a ball: number ``which`` of ``count`` on a spiral."""
+    height = 1.0 - (2.0 * which.double() + 1.0) / count
+    angle = which.double() * (math.pi * (3.0 - 5.0**0.5))
+    ring = (1.0 - height * height).sqrt()
+    return torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1)
+
+
+def _across(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors along planes of normals [M, 3]."""
+    other = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
+    one = torch.nn.functional.normalize(torch.linalg.cross(normal, other), dim=1)
+    return one, torch.linalg.cross(normal, one)
 
 
 def quantile(share: Tensor, least: float, most: float) -> Tensor:

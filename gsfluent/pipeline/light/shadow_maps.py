@@ -51,6 +51,8 @@ _BIAS_TEXELS = 1.0
 # The bulk of the matter: at most this many root-mean-square distances from its mean.
 _BULK = 3.0
 _NEAR = 1e-4
+# Shortest over longest axis up to which a grain is one of the sides of a chip, and no mist.
+_PLATE = 0.5
 
 
 class Bulk(NamedTuple):
@@ -107,7 +109,9 @@ def shadow_maps(
         return None
     opacities = gaussians.opacities
     if gaussians.labels is not None:
-        opacities = torch.where(gaussians.labels == SPRAY, 0.0, opacities)
+        short, long = gaussians.scales.aminmax(dim=1)
+        mist = (gaussians.labels == SPRAY) & (short > _PLATE * long)
+        opacities = torch.where(mist, 0.0, opacities)
     rows = []
     for lamp, count in zip(lamps, faces, strict=True):
         if count == 0:

@@ -10,5 +10,5 @@ __getattr__, __dir__, __all__ = room(
     looks="Liquids",
     nozzle="WAITING pours",
     parts="LiquidParts",
-    sheet="CLOSED ellipsoids",
+    sheet="CLOSED TENSION ellipsoids",
 )

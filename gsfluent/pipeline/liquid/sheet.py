@@ -34,6 +34,10 @@ SPRAY = 0.5
 """Size of a splat without neighbours over that of one inside."""
 CLOSED = 0.6
 """Splats of this many standard deviations per spacing close a packing of points."""
+TENSION = 1.5e-3
+"""Distance [m] over which surface tension leaves no gap, notch or ripple, however fine the points
+are: the capillary length of water and of milk is 2.3 to 2.7 mm. Drops that are finer are a mist,
+which casts no shadow."""
 FILM = 0.9
 """The same in a film, whose points lie less evenly."""
 

@@ -40,6 +40,7 @@ from gsfluent.pipeline.liquid.clear import (
     surface_normals,
 )
 from gsfluent.pipeline.liquid.closing import closed
+from gsfluent.pipeline.liquid.sheet import TENSION
 from gsfluent.pipeline.render.backdrop import Backdrop
 from gsfluent.pipeline.render.merge import merged
 from gsfluent.pipeline.render.studio import Studio
@@ -402,7 +403,7 @@ def _liquid(
     size, eye = (camera.width, camera.height), -(view[0][:3, 3] @ view[0][:3, :3])
     rows = clear.rows.nonzero()[:, 0]
     mine = gaussians.select(rows)
-    spacing = float(clear.volume.median()) ** (1.0 / 3.0)
+    spacing = max(float(clear.volume.median()) ** (1.0 / 3.0), TENSION)
     infinite = clear.attenuation.isinf()
     opaque = bool(infinite.all())
     front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))

@@ -130,15 +130,20 @@ def test_cube_and_single_map_of_a_point_lamp_agree(skin: Gaussians) -> None:
     assert float((found[0] - found[1]).abs().mean()) < 0.01
 
 
-def test_grains_of_a_spray_shade_nothing(skin: Gaussians) -> None:
+def test_mist_shades_nothing_and_chips_do(skin: Gaussians) -> None:
     lamps = (Lamp(direction=(0.3, -0.4, 1.0)),)
     faces = faces_of(lamps, matter := bulk(skin))
-    grains = skin.replace(means=1.3 * skin.means, scales=0.1 * skin.scales).labelled(SPRAY)
+    round_ = torch.full_like(skin.scales, 0.1 * float(skin.scales.mean()))
+    mist = skin.replace(means=1.3 * skin.means, scales=round_).labelled(SPRAY)
     alone = shadow_maps(skin, lamps, faces, 128, matter)
-    both = shadow_maps(Gaussians.cat([skin, grains]), lamps, faces, 128, matter)
-    shading = shadow_maps(Gaussians.cat([skin, grains.labelled(0)]), lamps, faces, 128, matter)
-    assert alone is not None and both is not None and shading is not None
-    assert torch.equal(both.alpha, alone.alpha) and not torch.equal(shading.alpha, alone.alpha)
+    both = shadow_maps(Gaussians.cat([skin, mist]), lamps, faces, 128, matter)
+    assert alone is not None and both is not None
+    assert torch.equal(both.alpha, alone.alpha)
+    flat = round_ * torch.tensor([1.0, 1.0, 0.1])
+    sides = mist.replace(scales=flat)
+    for shading in (mist.labelled(0), sides):
+        maps = shadow_maps(Gaussians.cat([skin, shading]), lamps, faces, 128, matter)
+        assert maps is not None and not torch.equal(maps.alpha, alone.alpha)
 
 
 def test_what_flew_onto_the_border_of_a_map_shades_nothing_beyond(skin: Gaussians) -> None:

@@ -16,6 +16,7 @@ from gsfluent.data import Camera, Gaussians
 from gsfluent.pipeline.light.lamps import studio_light
 from gsfluent.pipeline.liquid.clear import Clear, Surface
 from gsfluent.pipeline.liquid.closing import closed
+from gsfluent.pipeline.liquid.sheet import ellipsoids
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
 
@@ -211,3 +212,31 @@ def test_water_alone_hides_no_surroundings() -> None:
     assert torch.equal(stage(water, clear=every).image, dim(water, clear=every).image)
     milk = every._replace(attenuation=torch.full_like(lets, math.inf))
     assert not torch.equal(stage(water, clear=milk).image, dim(water, clear=milk).image)
+
+
+def test_a_film_of_fine_points_has_the_rim_of_a_liquid() -> None:
+    """Points half a millimetre apart thin out at the rim of a pool: it is as smooth as that of
+    points three times as coarse, and no fringe of dots; its face mirrors without ripples."""
+    fine, generator = 5e-4, torch.Generator().manual_seed(3)
+    line = torch.arange(-0.03, 0.03, fine)
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    means = torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3)
+    means = means + 0.3 * fine * (torch.rand(means.shape, generator=generator) - 0.5)
+    far = means.norm(dim=1)
+    kept = torch.rand(len(far), generator=generator) < ((0.027 - far) / 0.006).clamp(0.0, 1.0)
+    means = means[kept]
+    volume = torch.full((len(means),), fine**3)
+    drawn = ellipsoids(means, volume)
+    paint = torch.full_like(means, 0.9)
+    milk = Gaussians.from_colors(drawn.means, drawn.scales, paint, opacities=0.95)
+    milk = milk.replace(quats=drawn.quats)
+    rows = torch.ones(len(means), dtype=torch.bool)
+    clear = Clear(rows, volume, torch.full_like(volume, math.inf), torch.tensor([0.5, 60.0]))
+    near = Camera.look_at((0.0, -1e-3, 0.4), (0.0, 0.0, 0.0), width=240, height=240, fov=10.0)
+    made = Render(near, studio_light())(milk, clear=clear)
+    rows, columns = (made.alpha > 0.5).nonzero().double().sub(119.5).unbind(dim=1)
+    sector = ((torch.atan2(rows, columns) / math.pi + 1.0) * 36.0).long().clamp(max=71)
+    rim = torch.zeros(72, dtype=torch.float64)
+    rim.scatter_reduce_(0, sector, rows.hypot(columns), "amax")
+    assert float(rim.min()) > 80.0 and float(rim.std()) < 1.2
+    assert float(made.image[100:140, 100:140].std(dim=(0, 1)).max()) < 0.01
