@@ -18,7 +18,7 @@ from torch import Tensor
 from gsfluent.data import Camera
 from gsfluent.draw import draw_at
 from gsfluent.errors import InputError, RunError
-from gsfluent.pipeline.carrying.stage import carried
+from gsfluent.pipeline.carrying import carried
 from gsfluent.pipeline.fit.forward import Forward, TooFast
 from gsfluent.pipeline.fit.parameters import Unknowns, read_learn
 from gsfluent.pipeline.fit.stage import Found, with_values
