@@ -130,6 +130,7 @@ class Fit(Verb):
       gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
       gsfluent fit shot.yaml --masks films/ --cameras capture/ --learn melon.young_modulus -o out
       gsfluent fit shot.yaml --points track.npz --laws elastic,von_mises,fluid -o out
+      gsfluent fit shot.yaml --guidance sds --model zeroscope/ --prompt "jelly falls" --learn ...
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
     What the motion does not show is called unidentified and given as a bound. A fit that was
@@ -154,6 +155,14 @@ class Fit(Verb):
     """Films of masks: a folder for each camera, named as its image, with a picture per frame."""
     cameras: Path | None = None
     """Of --masks: COLMAP model or transforms.json in the frame of the splats; they stand still."""
+    guidance: Literal["sds"] | None = None
+    """Instead of what was seen: a text and a video model's score distillation. No measurement."""
+    model: Path | None = None
+    """Of --guidance: folder of a text-to-video pipeline of diffusers."""
+    prompt: str | None = None
+    """Of --guidance: what the film shows."""
+    rounds: int = 60
+    """Of --guidance: steps; each takes a run for every number, and one."""
     sigma: float | None = None
     """Standard deviation of what was seen [m, N; of a pixel none]."""
     fps: float | None = None
@@ -178,7 +187,17 @@ class Fit(Verb):
             if getattr(self, name) is not None:
                 existing(getattr(self, name), f"--{name}")
         shot = load_shot(existing(self.shot, "SHOT.yaml", folder=False))
+        if self.guidance is None and (self.model is not None or self.prompt is not None):
+            raise InputError("fit: --model and --prompt belong to --guidance sds", "add it")
         with self.reporter() as report:
+            if self.guidance is not None:
+                from gsfluent.fit.guided import guide_to
+
+                return guide_to(
+                    shot, self.out, self.learn, device=self.torch_device(), reporter=report,
+                    model=self.model, prompt=self.prompt, rounds=self.rounds,
+                    **self.given("cells", "seed"),
+                )  # fmt: skip
             return fit_to(
                 shot, self.out, self.learn, device=self.torch_device(), reporter=report,
                 laws=[law.strip() for law in (self.laws or "").split(",") if law.strip()],
@@ -195,7 +214,8 @@ class Fit(Verb):
             lines.append(f"{place}: {facts['taken']} (foretells to {error:.2g} sd{also})")
         for key, number in result["parameters"].items():
             bound = result["unidentified"].get(key)
-            said = f"unidentified: {bound}" if bound else f"{number['value']} (sd {number['sd']})"
+            how = f"sd {number['sd']}" if "sd" in number else f"began at {number['start']}"
+            said = f"unidentified: {bound}" if bound else f"{number['value']} ({how})"
             lines.append(f"{key}: {said}")
         lines += [f"  ! {warning}" for warning in result["warnings"]]
         return "\n".join([*lines, f"{self.out / result['outputs']['shot']}"])

@@ -218,3 +218,29 @@ def test_one_target_it_is(
     words = ["fit", "shot.yaml", "--learn", "it.young_modulus", "-o", "other", *more]
     assert main(words) == 2
     assert what in capsys.readouterr().err
+
+
+def test_a_text_and_a_video_model_guide(
+    thrown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    class Darker:
+        def __init__(self, model: Path, prompt: str, *, device: Any) -> None:
+            assert prompt == "jelly falls"
+
+        def push(self, clip: torch.Tensor, random: torch.Generator) -> torch.Tensor:
+            return torch.rand(clip.shape, generator=random) - 0.5
+
+    monkeypatch.setattr("gsfluent.fit.guided.VideoPrior", Darker)
+    words = ["fit", str(thrown / "shot.yaml"), "--learn", "it.young_modulus", "--guidance", "sds"]
+    words += ["--cells", "4", "--rounds", "1", "-o", str(tmp_path), "--device", "cpu"]
+    assert main(words) == 2
+    assert "--model and --prompt" in capsys.readouterr().err
+    assert main([*words, "--model", str(tmp_path), "--prompt", "jelly falls"]) == 0
+    assert "began at 50000.0" in capsys.readouterr().out
+    values = json.loads((tmp_path / "fit.json").read_text())
+    young = values["parameters"]["it.young_modulus"]["value"]
+    assert young == pytest.approx(5e4 * 10**0.1, rel=1e-3) or young == pytest.approx(
+        5e4 / 10**0.1, rel=1e-3
+    )
+    entry = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["objects"]["it"]
+    assert entry["young_modulus"] == pytest.approx(young)

@@ -2,4 +2,6 @@
 
 from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = room(__name__, binding="Binding bind", stage="CarriedFrame Carry")
+__getattr__, __dir__, __all__ = room(
+    __name__, binding="Binding bind", stage="CarriedFrame Carry carried"
+)

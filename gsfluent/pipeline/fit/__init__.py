@@ -3,5 +3,10 @@
 from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
-    __name__, stage="Fit Found", task="Task run_task", laws="plain"
+    __name__,
+    stage="Fit Found",
+    guidance="Guide",
+    video_prior="VideoPrior",
+    task="Task run_task",
+    laws="plain",
 )

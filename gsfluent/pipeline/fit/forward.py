@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -35,6 +35,8 @@ CFL = 0.4
 HASTE = 1.3
 """Margin of the time step for waves that matter under pressure carries faster."""
 MOST_STEPS = 200_000
+MOST_POINTS = 1_000_000
+"""Of runs that are done as one on a GPU."""
 
 
 class Matter(NamedTuple):
@@ -61,6 +63,13 @@ class Matter(NamedTuple):
 
 class TooFast(Exception):
     """The time step was too long for what these numbers do."""
+
+
+def _motion(shown: Sequence[tuple[Tensor, ...]]) -> Motion:
+    """What was shown frame by frame."""
+    where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
+    change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
+    return Motion(where, maps, pushes, 0.5 * change.abs().amax())
 
 
 class Forward:
@@ -166,6 +175,17 @@ class Forward:
         speed = max(speed, float(self.rigid.speed(self.rigid.start)))
         return CFL * self.dx / (HASTE * wave + speed)
 
+    @property
+    def side_by_side(self) -> int:
+        """How many runs are best done as one, of bodies that never meet.
+
+        A GPU is idle with a few thousand points. A floor is the same for all of them; what stands
+        anywhere else is not.
+        """
+        if self.device.type != "cuda" or self.scene.colliders:
+            return 1
+        return max(1, MOST_POINTS // self.count)
+
     def run(self, values: Mapping[str, Any], frames: int, dt: float) -> Motion:
         """Move the scene.
 
@@ -177,56 +197,94 @@ class Forward:
         Raises:
             TooFast: The step was too long.
         """
-        self.runs += 1
-        matter = self._matter(values)
-        copies = matter.copies
-        position, velocity, affine = self.start(values)
-        lift = position.new_tensor([0.0, 0.0, float(values.get(OFFSET, 0.0)) * self.dx])
-        rows = self.rigid.start
-        # a step of the solver kicks first, then drifts: half a kick less makes it second order
-        first = next((t for t in self.times if t > 0.0), dt)
-        kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
-        velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
-        body, there = self._fields(), self.device
-        moved = {k: v.to(there) for k, v in matter._asdict().items() if k != "copies"}
-        matter = matter._replace(**moved)
+        return self.run_all([values], frames, dt)[0]
+
+    def run_all(self, sets: Sequence[Mapping[str, Any]], frames: int, dt: float) -> list[Motion]:
+        """Move the scene with each of these sets of numbers, side by side in one run of the solver.
+
+        Args:
+            sets: See :meth:`run`.
+            frames: How many of the frames.
+            dt: Longest time step [s]; divided so that frames are met.
+
+        Raises:
+            TooFast: The step was too long for one of them.
+        """
+        self.runs += len(sets)
+        made = [self._placed(values, dt, k) for k, values in enumerate(sets)]
+        parts = [dict(one) for one, _, _ in made]
+        shifts = [shift for _, shift, _ in made]
+        size, more = made[0][2].copies * self.count, 0
+        for part in parts:
+            part["material"] = part["material"] + more
+            more += len(part["law"])
+        whole = {name: torch.cat([part[name] for part in parts]).to(self.device)
+                 for name in parts[0]}  # fmt: skip
+        body = self._fields()
+        if body is not None:
+            each = body.repeat(made[0][2].copies)
+            body = torch.cat([each + k * len(self.ranges) for k in range(len(sets))])
+        rows, there = self.rigid.start, self.device
         solver = ops.Solver(
-            (position + lift).repeat(copies, 1).to(there), velocity.repeat(copies, 1).to(there),
-            matter.mass, matter.volume, dx=self.dx, law=matter.law, params=matter.params,
-            material=matter.material, alpha=matter.alpha[matter.material.long()],
-            affine=affine.repeat(copies, 1, 1).to(there),
-            deformation=torch.eye(3, dtype=torch.float64).repeat(copies * self.count, 1, 1)
-            .to(there),
-            body=None if body is None else body.repeat(copies).to(there),
-            gravity=self.scene.gravity, colliders=rows.to(there) if rows.shape[0] else None,
+            dx=self.dx, body=None if body is None else body.to(there), gravity=self.scene.gravity,
+            colliders=rows.to(there) if rows.shape[0] else None,
             sdf=None if self.rigid.sdf is None else self.rigid.sdf.to(there),
-            friction=self.scene.friction, dt=dt,
+            friction=self.scene.friction, dt=dt, **whole,
         )  # fmt: skip
-        shown: list[tuple[Tensor, ...]] = []
+        shown: list[list[tuple[Tensor, ...]]] = [[] for _ in sets]
         now, steps = 0.0, 0
         for time in self.times[:frames]:
             span = time - now
             if span > 0.0:
-                parts = max(1, math.ceil(span / dt - 1e-9))
-                steps += parts
+                count = max(1, math.ceil(span / dt - 1e-9))
+                steps += count
                 if steps > MOST_STEPS:
                     raise TooFast
-                solver._write(dt_fixed=span / parts)
+                solver._write(dt_fixed=span / count)
                 try:
-                    solver.advance(steps=parts)
+                    solver.advance(steps=count)
                 except (SolverError, ValueError) as error:
                     raise TooFast from error
                 now = time
-            place = solver.position[: self.count].double().cpu() - lift
-            map = solver.deformation
+            place, map = solver.position.double().cpu(), solver.deformation
             assert map is not None  # tracked from the start
             if not bool(torch.isfinite(place).all()):
                 raise TooFast
+            map = map.double().cpu()
             impulse = solver.impulse.cpu() if rows.shape[0] else place.new_zeros(0, 3)
-            shown.append((place, map[: self.count].double().cpu().clone(), impulse))
-        where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
-        change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
-        return Motion(where, maps, pushes, 0.5 * change.abs().amax())
+            for k, shift in enumerate(shifts):
+                own = slice(k * size, k * size + self.count)
+                shown[k].append((place[own] - shift, map[own].clone(), impulse))
+        return [_motion(one) for one in shown]
+
+    def _placed(
+        self, values: Mapping[str, Any], dt: float, number: int
+    ) -> tuple[dict[str, Tensor], Tensor, Matter]:
+        """Points with these numbers as the solver takes them, and how far off they are laid."""
+        matter = self._matter(values)
+        copies = matter.copies
+        position, velocity, affine = self.start(values)
+        shift = position.new_tensor([0.0, 0.0, float(values.get(OFFSET, 0.0)) * self.dx])
+        shift[0] += number * self._apart()
+        # a step of the solver kicks first, then drifts: half a kick less makes it second order
+        first = next((t for t in self.times if t > 0.0), dt)
+        kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
+        velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
+        eye = torch.eye(3, dtype=torch.float64)
+        return {
+            "position": (position + shift).repeat(copies, 1),
+            "velocity": velocity.repeat(copies, 1), "mass": matter.mass, "volume": matter.volume,
+            "law": matter.law, "params": matter.params, "material": matter.material,
+            "alpha": matter.alpha[matter.material.long()], "affine": affine.repeat(copies, 1, 1),
+            "deformation": eye.repeat(copies * self.count, 1, 1),
+        }, shift, matter  # fmt: skip
+
+    def _apart(self) -> float:
+        """A whole number of blocks [m] that bodies side by side never cross."""
+        span = self.rest.amax(dim=0) - self.rest.amin(dim=0)
+        speed = float(self._velocity.norm(dim=1).max()) + 5.0
+        reach = 2.0 * float(span.max()) + 2.0 * speed * self.times[-1] + 16.0 * self.dx
+        return 4.0 * self.dx * math.ceil(reach / (4.0 * self.dx))
 
     def _matter(self, values: Mapping[str, Any]) -> Matter:
         """Points and materials with these numbers."""

@@ -9,7 +9,7 @@ it gets wrong for all points of a frame alike.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,15 +114,31 @@ class Problem:
 
     def motion(self, free: Array, frames: int, dt: float, *, keep: bool = False) -> Motion:
         """Run these coordinates; of a run that is kept only what the grid changes is done anew."""
-        values = self.fixed | self.unknowns.values(free)
-        more = values.pop(FINER, 0.0)
-        key = (values, frames, dt)
-        if self._last is not None and self._last[0] == key:
-            moved = self._last[1]
-        else:
-            moved = self.forward.run(values, frames, dt)
-        if keep:
-            self._last = (key, moved)
+        return self.motions([free], frames, dt, keep=keep)[0]
+
+    def motions(
+        self, places: Sequence[Array], frames: int, dt: float, *, keep: bool = False
+    ) -> list[Motion]:
+        """Runs of several coordinates, side by side where that is cheaper."""
+        sets = [self.fixed | self.unknowns.values(free) for free in places]
+        more = [values.pop(FINER, 0.0) for values in sets]
+        known = [self._last is not None and self._last[0] == (v, frames, dt) for v in sets]
+        left = [values for values, is_known in zip(sets, known, strict=True) if not is_known]
+        group = self.forward.side_by_side
+        made = []
+        for k in range(0, len(left), group):
+            made += self.forward.run_all(left[k : k + group], frames, dt)
+        fresh = iter(made)
+        found = []
+        for values, is_known, part in zip(sets, known, more, strict=True):
+            moved = self._last[1] if is_known and self._last else next(fresh)
+            if keep:
+                self._last = ((values, frames, dt), moved)
+            found.append(self._corrected(moved, frames, part))
+        return found
+
+    def _corrected(self, moved: Motion, frames: int, more: float) -> Motion:
+        """With so much of what the finer grid changes."""
         if self.change is None:
             return moved
         return moved._replace(
@@ -310,16 +326,29 @@ def _jacobian(
     rows: NDArray[np.int64], scale: float,
 ) -> Array:  # fmt: skip
     """By forward differences; a coordinate whose step fails is stepped back."""
+
+    def ahead(row: int, sign: float) -> Array:
+        trial = free.copy()
+        trial[row] += sign * problem.step
+        return trial
+
+    def column(motion: Motion, sign: float) -> Array:
+        found = problem.seen(motion, frames, pairs)[0] / scale
+        return (found - residual) / (sign * problem.step)
+
+    try:
+        made = problem.motions([ahead(row, 1.0) for row in rows], frames, dt)
+        return np.stack([column(motion, 1.0) for motion in made], axis=1)
+    except TooFast:
+        pass
     columns = []
     for row in rows:
         for sign in (1.0, -1.0):
-            trial = free.copy()
-            trial[row] += sign * problem.step
             try:
-                found = problem.seen(problem.motion(trial, frames, dt), frames, pairs)[0] / scale
+                motion = problem.motion(ahead(row, sign), frames, dt)
             except TooFast:
                 continue
-            columns.append((found - residual) / (sign * problem.step))
+            columns.append(column(motion, sign))
             break
         else:
             columns.append(np.zeros_like(residual))

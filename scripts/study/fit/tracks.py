@@ -140,7 +140,7 @@ def scene_of(kind: Kind, solid: Solid, values: dict[str, float], velocity: Any) 
 
 
 def fall(
-    kind: Kind, number: int, cells: int, random: np.random.Generator
+    kind: Kind, number: int, cells: int, random: np.random.Generator, device: str = "cpu"
 ) -> tuple[Solid, np.ndarray, dict[str, float], list[Particles]]:
     """A thing, its velocity and numbers, its points at the frames of its fall."""
     solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
@@ -148,17 +148,17 @@ def fall(
     drawn = {name: random.uniform(*ends) for name, ends in kind.truth.items()}
     true = {name: v if name in PLAIN else 10**v for name, v in drawn.items()}
     dx = SIDE / (cells * RATIO * 2.0)
-    run = Simulate(dx=dx, seed=100 + number, repair=False)(
+    run = Simulate(dx=dx, seed=100 + number, repair=False, device=device)(
         scene_of(kind, solid, true, velocity), fps=FPS, seconds=FRAMES / FPS
     )
-    return solid, velocity, true, [frame.particles for frame in run]
+    return solid, velocity, true, [frame.particles.to("cpu") for frame in run]
 
 
 def seen(
-    kind: Kind, number: int, cells: int, random: np.random.Generator
+    kind: Kind, number: int, cells: int, random: np.random.Generator, device: str = "cpu"
 ) -> tuple[Solid, np.ndarray, dict[str, float], np.ndarray, int]:
     """A thing, its velocity and numbers, tracks of its fall, how many points moved."""
-    solid, velocity, true, frames = fall(kind, number, cells, random)
+    solid, velocity, true, frames = fall(kind, number, cells, random, device)
     places = [frame.position.double().numpy() for frame in frames]
     rows = random.choice(len(places[0]), TRACKS, replace=False)
     return solid, velocity, true, np.stack([place[rows] for place in places]), len(places[0])
@@ -167,17 +167,18 @@ def seen(
 def keep(task: Task, found: dict[str, Any], path: Path) -> None:
     """Residuals and Jacobian where a search has ended, so that other bands may be tried on them."""
     times = list(task.target.times)
-    forward = Forward(task.scene, times, task.dx)
+    forward = Forward(task.scene, times, task.dx, device=task.device)
     problem = Problem(
         forward, task.target.observe(forward.setting()), task.unknowns, task.target.step
     )
     free = np.asarray(found["free"])
-    problem.refine(Forward(task.scene, times, task.dx / RATIO), free, len(times))
+    finer = Forward(task.scene, times, task.dx / RATIO, device=task.device)
+    problem.refine(finer, free, len(times))
     here = linearise(problem, free, len(times))
     np.savez_compressed(
         path, labels=task.unknowns.labels(), free=free, start=task.unknowns.start,
         spread=task.unknowns.spread, slope=task.unknowns.slope(free), trust=problem.trust,
-        residual=here.residual.astype(np.float32), jacobian=here.jacobian.astype(np.float32),
+        residual=here.residual.astype(np.float16), jacobian=here.jacobian.astype(np.float32),
         scale=here.scale, frame=here.frame.astype(np.int16),
         covariance=np.asarray(found["covariance"]),
     )  # fmt: skip
@@ -201,14 +202,16 @@ def errors_of(found: Found, true: dict[str, float], velocity: np.ndarray) -> lis
     return errors
 
 
-def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict[str, Any]:
+def record(
+    kind: str, number: int, cells: int, kept: Path | None = None, device: str = "cpu"
+) -> dict[str, Any]:
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
     here = KINDS[kind]
     random = np.random.default_rng([number, len(kind)])
-    begun = clock.process_time()
-    solid, velocity, true, tracks, points = seen(here, number, cells, random)
-    middle = clock.process_time()
+    begun = clock.perf_counter()
+    solid, velocity, true, tracks, points = seen(here, number, cells, random, device)
+    middle = clock.perf_counter()
     guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))
     learn = [f"it.{name}" for name in (*true, "velocity")]
     searches: list[tuple[Task, dict[str, Any]]] = []
@@ -219,9 +222,9 @@ def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict
         searches.extend(zip(tasks, done, strict=True))
         return done
 
-    fit = Fit(learn, starts=1, cells=cells, runner=runner)
+    fit = Fit(learn, starts=1, cells=cells, runner=runner, device=device)
     found = fit(guess, Points(tracks, fps=FPS))
-    end = clock.process_time()
+    end = clock.perf_counter()
     if kept is not None:
         keep(*searches[-1], kept / f"{kind}_{number}.npz")
     errors = errors_of(found, true, velocity)
@@ -231,7 +234,7 @@ def record(kind: str, number: int, cells: int, kept: Path | None = None) -> dict
         "grid": {k: found.values[k] for k in ("floor.offset", "grid.extrapolation")},
         "runs": [g["runs"] for g in found.report["grids"]],
         "points": [g["points"] for g in found.report["grids"]],
-        "truth_seconds": middle - begun, "fit_seconds": end - middle,
+        "truth_seconds": middle - begun, "fit_seconds": end - middle, "device": device,
     }  # fmt: skip
 
 
@@ -263,7 +266,7 @@ def table(records: list[dict[str, Any]]) -> str:
         "",
         f"Bands of 80 % hold {inside} of {inside + outside} numbers "
         f"({inside / (inside + outside):.0%}; bar 70 to 90 %).",
-        f"A fit takes {np.median(seconds):.0f} s of one core (longest {max(seconds):.0f} s): "
+        f"A fit takes {np.median(seconds):.0f} s beside others (longest {max(seconds):.0f} s): "
         f"{np.median(runs[:, 0]):.0f} runs on the coarser grid, {np.median(runs[:, 1]):.0f} on the "
         "finer (medians).",
     ]
@@ -312,6 +315,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=10, help="of each matter")
     parser.add_argument("--cells", type=int, default=8, help="along the thing, coarser grid")
     parser.add_argument("--only", nargs="*", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument(
         "--minutes", type=float, default=1e6, help="what is not done by then is left"
@@ -327,7 +331,7 @@ def main() -> None:
     done = {(r["kind"], r["scene"]) for r in records}
     slow_first = [(k, n) for n in range(options.scenes) for k in reversed(options.only)]
     wanted = [pair for pair in slow_first if pair not in done]
-    tasks = [(kind, number, options.cells, options.keep) for kind, number in wanted]
+    tasks = [(k, n, options.cells, options.keep, options.device) for k, n in wanted]
     records += in_pool(record, tasks, path, options.jobs, options.minutes)
     if records:
         page: Path = options.markdown

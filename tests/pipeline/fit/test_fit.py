@@ -18,7 +18,7 @@ from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
-from gsfluent.pipeline.fit.solve import Problem, in_stages, search
+from gsfluent.pipeline.fit.solve import Problem, in_stages, linearise, search
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
 from gsfluent.targets import Clouds, Force, Masks, Points
 from gsfluent.targets.target import Followers
@@ -256,3 +256,26 @@ def test_targets_elsewhere_are_refused(tracks: Any) -> None:
             Points(wrong)
     with pytest.raises(InputError, match="ascend"):
         Force([0, 0.1, 0.1], [0, 1, 2], speed=1.0)
+
+
+def test_runs_side_by_side_are_those_one_by_one(
+    tracks: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a GPU does them: bodies that never meet, on the same floor, and the same Jacobian."""
+    made = problem(Points(tracks), scene(elastic(7e4)), NAMES)
+    forward, free = made.forward, made.unknowns.start
+    values = [made.unknowns.values(free + step) for step in (0.0, 0.1, -0.1)]
+    dt = 0.8 * forward.step(values[1])
+    alone = [forward.run(v, 6, dt) for v in values]
+    together = forward.run_all(values, 6, dt)
+    for one, other in zip(alone, together, strict=True):
+        assert float((one.position - other.position).abs().max()) < 1e-9
+        assert float((one.deformation - other.deformation).abs().max()) < 1e-8
+    assert float((alone[1].position - alone[2].position).abs().max()) > 1e-3
+    before = linearise(made, free, 6)
+    monkeypatch.setattr(Forward, "side_by_side", 2)
+    runs = forward.runs
+    after = linearise(made, free, 6)
+    size = float(np.abs(before.jacobian).max())
+    assert float(np.abs(after.jacobian - before.jacobian).max()) < 1e-4 * size
+    assert forward.runs - runs == 5  # its middle is known
