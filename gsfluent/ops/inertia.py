@@ -18,7 +18,7 @@ from gsfluent.ops.mpm import g2p, p2g
 LEAST = 0.4
 """Smallest share: lighter points could need shorter steps."""
 PARTS = 64
-"""Shares are whole multiples of one over this, so that a solver has few different points."""
+"""Shares are whole multiples of about one over this: a solver keeps few different points."""
 
 
 def inertial_shares(position: Tensor, *, volume: Tensor, dx: float) -> Tensor:
@@ -37,7 +37,7 @@ def inertial_shares(position: Tensor, *, volume: Tensor, dx: float) -> Tensor:
         dx: Node spacing [m].
 
     Returns:
-        Shares, [N]; their mean by volume is 1 to a part in a hundred of :data:`PARTS`.
+        Shares, [N]; their mean by volume is 1.
 
     Raises:
         TypeError: A tensor has a wrong dtype.
@@ -77,4 +77,5 @@ def inertial_shares(position: Tensor, *, volume: Tensor, dx: float) -> Tensor:
     if not (moved < 0.0 and deepest < 0.0):  # a single point
         return torch.ones_like(volume)
     scale = min(max(wanted / moved, 0.0), (1.0 - LEAST) / -deepest)
-    return (1.0 + (PARTS * scale * lack).round() / PARTS).to(volume)
+    shares = 1.0 + (PARTS * scale * lack).round() / PARTS
+    return (shares * (v.sum() / (v * shares).sum())).to(volume)

@@ -13,6 +13,7 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.ops.plasticity import LAWS
 from gsfluent.pipeline.matter.points import build_matter, sample_points
+from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.scene.scene import Scene
 
 
@@ -144,6 +145,26 @@ def test_sampled_mass_is_density_times_volume():
     assert bool(solid.contains(matter.rest).all())
     cells = solid.volume / 0.02**3
     assert 0.8 * 8 < matter.particles.count / cells < 1.2 * 8
+
+
+def test_a_body_that_lasts_may_have_its_own_inertia():
+    solid = ellipsoid((0.1, 0.03, 0.03))
+    for material, changes in ((materials.elastic, True), (materials.fruit.watermelon, False)):
+        scene = Scene(floor=None)
+        scene.add(solid, material)
+        plain, own = (build_matter(scene, 0.012, inertia=wanted) for wanted in (False, True))
+        a, b = plain.particles.mass, own.particles.mass
+        assert torch.equal(plain.rest, own.rest)
+        assert math.isclose(float(a.sum()), float(b.sum()), rel_tol=1e-5)
+        if changes:
+            far = own.rest[:, 1:].double() - own.rest[:, 1:].double().mean(0)
+            assert float((b * far.square().sum(1)).sum()) < 0.9 * float(
+                (a * far.square().sum(1)).sum()
+            )
+        else:
+            assert torch.equal(a, b)
+    with pytest.raises(InputError, match="inertia does not go with surface"):
+        SolverOptions(inertia=True, surface=True)
 
 
 def test_sampling_follows_the_frame_and_the_seed():
