@@ -139,6 +139,11 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("distance_transform(Tensor occupied, bool indices) -> (Tensor, Tensor)");
   m.def("trilinear(Tensor grid, Tensor place) -> Tensor");
   m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
+  m.def("hashes(Tensor seed, int[] turns) -> Tensor");
+  m.def("label_boxes(Tensor labels, int count) -> Tensor");
+  m.def(
+      "margin_counts(Tensor lead, Tensor first, Tensor second, Tensor offset, float width) -> "
+      "Tensor");
 
   // --- graph: links between points, what hangs together, the nearest seed along links ---
   m.def(

@@ -49,7 +49,10 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.ops.spatial": (
             "box_blur",
             "distance_transform",
+            "hashes",
+            "label_boxes",
             "largest_shares",
+            "margin_counts",
             "nearest_points",
             "nearest_labels",
             "trilinear",
