@@ -82,7 +82,6 @@ def calls() -> dict[str, Call]:
             splat[0], torch.rand(7, 4), near, torch.randint(-1, 3, (9,), dtype=torch.int32),
             torch.rand(9) < 0.5, *flags, 1.2, 1.5, 1.1, 0.9,
         )  # fmt: skip
-        lib.label_boxes(torch.randint(-1, 5, (4, 5, 6), dtype=torch.int16), 5)
         pair = (torch.randint(0, 5, (9,)), torch.randint(0, 5, (9,)))
         lib.margin_counts(torch.rand(9), *pair, torch.rand(5, dtype=torch.float64), 0.2)
         lib.splat_bulk(torch.rand(50, 3), torch.rand(50, 3))
@@ -95,7 +94,7 @@ NAMES = (
     "build_blocks p2g grid_update g2p p2g_adjoint transfer_slope return_mapping "
     "return_mapping_adjoint rasterize rasterize_backward collider_distance advance_colliders mvee "
     "polar_clamped covariance_axes cut_at_cells cut_by_planes "
-    "quats_to_matrices matrices_to_quats quat_products link_states label_boxes "
+    "quats_to_matrices matrices_to_quats quat_products link_states "
     "margin_counts splat_bulk ssim"
 ).split()
 
