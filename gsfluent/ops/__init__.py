@@ -43,6 +43,7 @@ __getattr__, __dir__, __all__ = lazy(
             "cut_by_planes",
             "link_states",
         ),
+        "gsfluent.ops.faces": ("FaceFit", "FaceSites", "face_elements", "find_faces"),
         "gsfluent.ops.mvee": ("mvee", "mvee_lens"),
         "gsfluent.ops.raster": ("Recorded", "Rendered", "rasterize", "rasterize_recorded"),
         "gsfluent.ops.density": ("Bulk", "splat_bulk", "occupancy", "density_normals"),
