@@ -85,6 +85,13 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor? parted_before, Tensor? opened_before, Tensor none, float together, float loose, "
       "float open, float back) -> (Tensor parted, Tensor opened, Tensor ratio)");
   m.def(
+      "find_faces(Tensor rows, Tensor means, Tensor owner, Tensor pitch, Tensor outward, "
+      "Tensor depth, Tensor near, Tensor opened, Tensor rest, float[] fit) -> Tensor");
+  m.def(
+      "face_elements(Tensor rows, Tensor column, Tensor means, Tensor owner, Tensor pitch, "
+      "Tensor outward, Tensor depth, Tensor near, Tensor opened, Tensor rest, float[] fit) -> "
+      "(Tensor rival, Tensor means, Tensor quats, Tensor scales, Tensor normals)");
+  m.def(
       "cut_at_cells(Tensor means, Tensor quats, Tensor scales, Tensor owner, Tensor near, "
       "Tensor opened, Tensor rest, float slack) -> (Tensor, Tensor, Tensor, Tensor)");
   m.def(
@@ -139,6 +146,11 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("distance_transform(Tensor occupied, bool indices) -> (Tensor, Tensor)");
   m.def("trilinear(Tensor grid, Tensor place) -> Tensor");
   m.def("value_noise(Tensor voxels, float[] spacings, float[] shifts, float[] weights) -> Tensor");
+  m.def("hashes(Tensor seed, int[] turns) -> Tensor");
+  m.def("label_boxes(Tensor labels, int count) -> Tensor");
+  m.def(
+      "margin_counts(Tensor lead, Tensor first, Tensor second, Tensor offset, float width) -> "
+      "Tensor");
 
   // --- graph: links between points, what hangs together, the nearest seed along links ---
   m.def(

@@ -5,6 +5,7 @@
 
 #include "core/deform/carry.h"
 #include "core/deform/cut.h"
+#include "core/deform/faces.h"
 #include "core/deform/link.h"
 #include "core/deform/turn.h"
 #include "cpu/svd.h"
@@ -110,6 +111,20 @@ struct DeformCpu {
   static void link_states(const LinkStatesArgs<T>& a, const Scope&) {
     parallel_for(a.count, 4096, [&](int64_t begin, int64_t end) {
       for (int64_t i = begin; i < end; ++i) gsf::link_states(a, i);
+    });
+  }
+  template <typename T>
+  static void find_faces(const FaceArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i)
+        for (int k = 0; k <= a.near_count; ++k)
+          a.has[i * (a.near_count + 1) + k] = has_face(a, i, k);
+    });
+  }
+  template <typename T>
+  static void face_elements(const FaceArgs<T>& a, const Scope&) {
+    parallel_for(a.count, 256, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) face_element(a, i);
     });
   }
   template <typename T>

@@ -210,6 +210,33 @@ struct SpatialCpu {
       for (int64_t i = begin; i < end; ++i) gsf::value_noise(a, i);
     });
   }
+
+  static void hashes(const HashesArgs& a, const Scope&) {
+    parallel_for(a.count * a.turns, 8192, [&](int64_t begin, int64_t end) {
+      for (int64_t k = begin; k < end; ++k) hash_one(a, k);
+    });
+  }
+
+  static void label_boxes(const LabelBoxesArgs& a, const Scope&) {
+    for (int64_t k = 0; k < 6 * a.count; ++k) a.box[k] = a.none(k);
+    const int16_t* label = a.labels;
+    for (int32_t x = 0; x < a.shape[0]; ++x)
+      for (int32_t y = 0; y < a.shape[1]; ++y)
+        for (int32_t z = 0; z < a.shape[2]; ++z, ++label) {
+          if (*label < 0 || *label >= a.count) continue;
+          int32_t* box = a.box + 6 * *label;
+          const int32_t place[3] = {x, y, z};
+          for (int axis = 0; axis < 3; ++axis) {
+            box[2 * axis] = std::min(box[2 * axis], place[axis]);
+            box[2 * axis + 1] = std::max(box[2 * axis + 1], place[axis]);
+          }
+        }
+  }
+
+  static void margin_counts(const MarginCountsArgs& a, const Scope&) {
+    for (int64_t i = 0; i < a.count; ++i)
+      gsf::margin_counts(a, i, [&](int64_t k) { ++a.found[k]; });
+  }
 };
 
 }  // namespace

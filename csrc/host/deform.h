@@ -168,6 +168,41 @@ struct DeformOps {
     return {parted, opened, ratio};
   }
 
+  static Tensor find_faces(Tensor rows, Tensor means, Tensor owner, Tensor pitch, Tensor outward,
+                           Tensor depth, Tensor near, Tensor opened, Tensor rest,
+                           std::vector<double> fit) {
+    return faces("find_faces", rows, OptTensor(), means, owner, pitch, outward, depth, near, opened,
+                 rest, fit, [](auto& args, const auto& scope, const Tensor& like) {
+                   Tensor has =
+                       gsf::new_empty(like, {args.count, args.near_count + 1}, ScalarType::Bool);
+                   args.has = mptr<bool>(has);
+                   if (args.count) Backend::find_faces(args, scope);
+                   return has;
+                 });
+  }
+
+  static std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> face_elements(
+      Tensor rows, Tensor column, Tensor means, Tensor owner, Tensor pitch, Tensor outward,
+      Tensor depth, Tensor near, Tensor opened, Tensor rest, std::vector<double> fit) {
+    return faces("face_elements", rows, column, means, owner, pitch, outward, depth, near, opened,
+                 rest, fit,
+                 []<typename T>(FaceArgs<T>& args, const auto& scope, const Tensor& like) {
+                   const ScalarType kind = like.scalar_type();
+                   Tensor rival = gsf::new_empty(like, {args.count}, ScalarType::Long);
+                   Tensor centers = gsf::new_empty(like, {args.count, 3}, kind);
+                   Tensor quats = gsf::new_empty(like, {args.count, 4}, kind);
+                   Tensor scales = gsf::new_empty(like, {args.count, 3}, kind);
+                   Tensor normals = gsf::new_empty(like, {args.count, 3}, kind);
+                   args.rival = mptr<int64_t>(rival);
+                   args.out_means = mptr<T>(centers);
+                   args.out_quats = mptr<T>(quats);
+                   args.out_scales = mptr<T>(scales);
+                   args.out_normals = mptr<T>(normals);
+                   if (args.count) Backend::face_elements(args, scope);
+                   return std::make_tuple(rival, centers, quats, scales, normals);
+                 });
+  }
+
   static std::tuple<Tensor, Tensor, Tensor, Tensor> cut_at_cells(Tensor means, Tensor quats,
                                                                  Tensor scales, Tensor owner,
                                                                  Tensor near, Tensor opened,
@@ -256,11 +291,56 @@ struct DeformOps {
     GSF_IMPL(DeformOps, matrices_to_quats);
     GSF_IMPL(DeformOps, quat_products);
     GSF_IMPL(DeformOps, link_states);
+    GSF_IMPL(DeformOps, find_faces);
+    GSF_IMPL(DeformOps, face_elements);
     GSF_IMPL(DeformOps, cut_at_cells);
     GSF_IMPL(DeformOps, cut_by_planes);
   }
 
  private:
+  // What both questions about faces are asked with: `ask(args, scope, means)`.
+  template <typename Ask>
+  static auto faces(const char* op, Tensor rows, OptTensor column, Tensor means, Tensor owner,
+                    Tensor pitch, Tensor outward, Tensor depth, Tensor near, Tensor opened,
+                    Tensor rest, const std::vector<double>& fit, const Ask& ask) {
+    means = ready(op, "means", means, means, {-1, 3});
+    const int64_t sites = means.size(0);
+    rows = ready(op, "rows", rows, means, {-1}, ScalarType::Long);
+    column = ready(op, "column", column, means, {rows.size(0)}, ScalarType::Long);
+    owner = ready(op, "owner", owner, means, {sites}, ScalarType::Long);
+    pitch = ready(op, "pitch", pitch, means, {sites});
+    outward = ready(op, "outward", outward, means, {sites, 3});
+    depth = ready(op, "depth", depth, means, {sites});
+    rest = ready(op, "rest", rest, means, {-1, 3});
+    near = ready(op, "near", near, means, {rest.size(0), -1}, ScalarType::Long);
+    opened = ready(op, "opened", opened, means, {rest.size(0), near.size(1)}, ScalarType::Bool);
+    STD_TORCH_CHECK(near.size(1) >= 1 && near.size(1) < 4096, op, ": near must have 1 to 4095 ",
+                    "columns, got ", near.size(1));
+    STD_TORCH_CHECK(fit.size() == kFaceFit, op, ": fit must be ", kFaceFit, " numbers, got ",
+                    fit.size());
+    const typename Backend::Scope scope(means);
+    return dispatch_floating(op, means, [&]<typename T>() {
+      FaceArgs<T> args{};
+      args.count = rows.size(0);
+      args.sites = sites;
+      args.points = rest.size(0);
+      args.near_count = static_cast<int>(near.size(1));
+      args.fit = {T(fit[0]), T(fit[1]), T(fit[2]), T(fit[3]), T(fit[4]),
+                  T(fit[5]), T(fit[6]), T(fit[7]), T(fit[8])};
+      args.rows = cptr<int64_t>(rows);
+      args.column = cptr<int64_t>(column);
+      args.means = cptr<T>(means);
+      args.owner = cptr<int64_t>(owner);
+      args.pitch = cptr<T>(pitch);
+      args.outward = cptr<T>(outward);
+      args.depth = cptr<T>(depth);
+      args.near = cptr<int64_t>(near);
+      args.opened = cptr<bool>(opened);
+      args.rest = cptr<T>(rest);
+      return ask(args, scope, means);
+    });
+  }
+
   // One of the ops of turn.h: `run(args, scope)`.
   template <typename Run>
   static Tensor turned(const Tensor& first, const OptTensor& second,

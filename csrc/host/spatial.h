@@ -4,6 +4,7 @@
 #include <limits>
 
 #include "core/distance.h"
+#include "core/labels.h"
 #include "core/nearest.h"
 #include "core/spatial.h"
 #include "torch_api.h"
@@ -216,6 +217,61 @@ struct SpatialOps {
     return noise;
   }
 
+  static Tensor hashes(Tensor seed, std::vector<int64_t> turns) {
+    const char* op = "hashes";
+    seed = ready(op, "seed", seed, seed, {-1}, ScalarType::Long);
+    STD_TORCH_CHECK(turns.size() <= kMostTurns, op, ": at most ", kMostTurns, " turns, got ",
+                    turns.size());
+    HashesArgs args{};
+    args.count = seed.size(0);
+    args.turns = static_cast<int>(turns.size());
+    args.seed = cptr<int64_t>(seed);
+    for (size_t k = 0; k < turns.size(); ++k)
+      args.salt[k] =
+          static_cast<uint32_t>(static_cast<uint64_t>(turns[k])) * 0x9E3779B1u + 0x2545F491u;
+    Tensor values = gsf::new_empty(seed, {args.count, args.turns}, ScalarType::Double);
+    args.values = mptr<double>(values);
+    const typename Backend::Scope scope(seed);
+    Backend::hashes(args, scope);
+    return values;
+  }
+
+  static Tensor label_boxes(Tensor labels, int64_t count) {
+    const char* op = "label_boxes";
+    labels = ready(op, "labels", labels, labels, {-1, -1, -1}, ScalarType::Short);
+    STD_TORCH_CHECK(count >= 0 && count <= 32768, op, ": count must be 0 to 32768, got ", count);
+    check_grid(op, {labels.size(0), labels.size(1), labels.size(2)});
+    Tensor box = gsf::new_empty(labels, {count, 6}, ScalarType::Int);
+    const LabelBoxesArgs args{{labels.size(0), labels.size(1), labels.size(2)},
+                              count,
+                              cptr<int16_t>(labels),
+                              mptr<int32_t>(box)};
+    const typename Backend::Scope scope(labels);
+    Backend::label_boxes(args, scope);
+    return box;
+  }
+
+  static Tensor margin_counts(Tensor lead, Tensor first, Tensor second, Tensor offset,
+                              double width) {
+    const char* op = "margin_counts";
+    lead = ready(op, "lead", lead, lead, {-1}, ScalarType::Float);
+    first = ready(op, "first", first, lead, {lead.size(0)}, ScalarType::Long);
+    second = ready(op, "second", second, lead, {lead.size(0)}, ScalarType::Long);
+    offset = ready(op, "offset", offset, lead, {-1}, ScalarType::Double);
+    Tensor found = gsf::new_zeros(lead, {2, offset.size(0)}, ScalarType::Long);
+    const MarginCountsArgs args{lead.size(0),
+                                offset.size(0),
+                                cptr<float>(lead),
+                                cptr<int64_t>(first),
+                                cptr<int64_t>(second),
+                                cptr<double>(offset),
+                                width,
+                                mptr<int64_t>(found)};
+    const typename Backend::Scope scope(lead);
+    Backend::margin_counts(args, scope);
+    return found;
+  }
+
   template <typename Library>
   static void register_all(Library& m) {
     GSF_IMPL(SpatialOps, nearest_labels);
@@ -225,6 +281,9 @@ struct SpatialOps {
     GSF_IMPL(SpatialOps, distance_transform);
     GSF_IMPL(SpatialOps, trilinear);
     GSF_IMPL(SpatialOps, value_noise);
+    GSF_IMPL(SpatialOps, hashes);
+    GSF_IMPL(SpatialOps, label_boxes);
+    GSF_IMPL(SpatialOps, margin_counts);
   }
 
  private:

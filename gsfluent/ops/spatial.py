@@ -16,6 +16,8 @@ from gsfluent._check import check_tensor
 from gsfluent.ops._register import fakes, no_gradient
 
 MOST_FIELDS = 32767
+MOST_TURNS = 64
+"""Values that :func:`hashes` draws for a number, at most."""
 MOST_OCTAVES = 16
 MOST_ALONG = 8192
 
@@ -254,6 +256,91 @@ def value_noise(
     return torch.ops.gsfluent.value_noise.default(voxels, *lists)
 
 
+def hashes(seed: Tensor, turns: Sequence[int]) -> Tensor:
+    """Uniform values in -1 to 1 from whole numbers, as many for each as there are turns.
+
+    A hash of 32 bits of the number, salted by the turn: the same on every device.
+
+    Args:
+        seed: Whole numbers of which the lower 32 bits count, int64 of any shape [...].
+        turns: Which values, at most 64.
+
+    Returns:
+        float64 [..., turns].
+
+    Raises:
+        TypeError: A wrong dtype.
+        ValueError: Too many turns.
+
+    Gradient: none.
+    """
+    check_tensor("hashes", "seed", seed, dtype=torch.int64)
+    if len(turns) > MOST_TURNS:
+        raise ValueError(f"hashes: at most {MOST_TURNS} turns, got {len(turns)}")
+    flat = torch.ops.gsfluent.hashes.default(seed.reshape(-1), [int(turn) for turn in turns])
+    return flat.view(*seed.shape, len(turns))
+
+
+def label_boxes(labels: Tensor, count: int) -> Tensor:
+    """First and last voxel of every label along each axis, int32 [count, 6]: x, x, y, y, z, z.
+
+    A label without a voxel has the size of the grid and -1.
+
+    Args:
+        labels: int16 [X, Y, Z]; what is not in 0 to ``count`` - 1 is passed over.
+        count: Number of labels, at most 32768.
+
+    Raises:
+        TypeError: A wrong dtype.
+        ValueError: A wrong shape or count.
+
+    Gradient: none.
+    """
+    check_tensor("label_boxes", "labels", labels, shape=("X", "Y", "Z"), dtype=torch.int16)
+    if not 0 <= count <= 32768:
+        raise ValueError(f"label_boxes: count must be 0 to 32768, got {count}")
+    box: Tensor = torch.ops.gsfluent.label_boxes.default(labels, int(count))
+    return box
+
+
+def margin_counts(
+    lead: Tensor, first: Tensor, second: Tensor, offset: Tensor, width: float
+) -> Tensor:
+    """Voxels that labels have when constants are added to their fields.
+
+    The field of a voxel's first label leads that of its second by ``m = lead + offset[first] -
+    offset[second]``: it has the first where m >= 0, and is in the band about a face of both where
+    ``|m| < width``.
+
+    Args:
+        lead: Before, float32 [M].
+        first: int64 [M]; a voxel one of whose labels is none is passed over.
+        second: int64 [M].
+        offset: Constants, float64 [F].
+        width: Of the band.
+
+    Returns:
+        Voxels of each label, and those in the bands about its faces, int64 [2, F].
+
+    Raises:
+        TypeError: A wrong dtype.
+        ValueError: A wrong shape or device.
+
+    Gradient: none.
+    """
+    op = "margin_counts"
+    check_tensor(op, "lead", lead, shape=("M",), dtype=torch.float32)
+    for name, value in (("first", first), ("second", second)):
+        check_tensor(op, name, value, shape=lead.shape, dtype=torch.int64, like=lead)
+    if offset.device != lead.device:
+        raise ValueError(f"{op}: offset is on {offset.device}, lead on {lead.device}; move it")
+    check_tensor(op, "offset", offset, shape=("F",), dtype=torch.float64)
+    found: Tensor = torch.ops.gsfluent.margin_counts.default(
+        lead, first, second, offset, float(width)
+    )
+    return found
+
+
 def _check_shape(op: str, shape: Sequence[int]) -> None:
     if len(shape) != 3 or any(n < 0 for n in shape):
         raise ValueError(f"{op}: shape must be three sizes, got {tuple(shape)}")
@@ -286,9 +373,12 @@ fakes(
     ),
     trilinear=lambda grid, place: grid.new_empty(place.shape[:1]),
     value_noise=lambda voxels, *rest: voxels.new_empty(voxels.shape, dtype=torch.float32),
+    hashes=lambda seed, turns: seed.new_empty((len(seed), len(turns)), dtype=torch.float64),
+    label_boxes=lambda labels, count: labels.new_empty((count, 6), dtype=torch.int32),
+    margin_counts=lambda lead, first, second, offset, width: first.new_empty((2, len(offset))),
 )
 no_gradient(
     "spatial: no gradient",
     "nearest_labels", "largest_shares", "nearest_points", "box_blur", "distance_transform",
-    "trilinear", "value_noise",
+    "trilinear", "value_noise", "hashes", "label_boxes", "margin_counts",
 )  # fmt: skip

@@ -69,13 +69,17 @@ def signed_depth(inside: Tensor, depth: Tensor) -> Tensor:
 
 
 def sample(field: Tensor, points: Tensor) -> Tensor:
-    """Trilinear values [N] of a field [X, Y, Z] at points [N, 3] in voxel units."""
-    size = torch.tensor(field.shape, device=field.device)
+    """Trilinear values [N] of a field [X, Y, Z] at points [N, 3] in voxel units.
+
+    Of several fields [C, X, Y, Z] at once the values are [C, N].
+    """
+    size = torch.tensor(field.shape[-3:], device=field.device)
     place = (2.0 * points.to(field) / size - 1.0).flip(-1)
+    several = field if field.dim() == 4 else field[None]
     value = functional.grid_sample(
-        field[None, None], place[None, None, None], align_corners=False, padding_mode="border"
-    )
-    return value[0, 0, 0, 0]
+        several[None], place[None, None, None], align_corners=False, padding_mode="border"
+    )[0, :, 0, 0]
+    return value if field.dim() == 4 else value[0]
 
 
 def small_pieces(index: Tensor, spacing: Tensor, seed: int) -> tuple[Tensor, Tensor, Tensor]:

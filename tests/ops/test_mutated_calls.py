@@ -82,6 +82,12 @@ def calls() -> dict[str, Call]:
             splat[0], torch.rand(7, 4), near, torch.randint(-1, 3, (9,), dtype=torch.int32),
             torch.rand(9) < 0.5, *flags, 1.2, 1.5, 1.1, 0.9,
         )  # fmt: skip
+        pair = (torch.randint(0, 5, (9,)), torch.randint(0, 5, (9,)))
+        lib.margin_counts(torch.rand(9), *pair, torch.rand(5, dtype=torch.float64), 0.2)
+        places = (torch.randn(9, 3), torch.randint(0, 7, (9,)), torch.rand(9), torch.randn(9, 3))
+        faces = (*places, torch.rand(9), near, opened, torch.randn(7, 3), [0.5] * 9)
+        lib.find_faces(torch.randint(0, 9, (12,)), *faces)
+        lib.face_elements(torch.randint(0, 9, (12,)), torch.randint(0, 5, (12,)), *faces)
         lib.splat_bulk(torch.rand(50, 3), torch.rand(50, 3))
         picture = torch.rand(32, 32, 3)
         lib.ssim(picture, picture.flip(1), True)
@@ -92,7 +98,8 @@ NAMES = (
     "build_blocks p2g grid_update g2p p2g_adjoint transfer_slope return_mapping "
     "return_mapping_adjoint rasterize rasterize_backward collider_distance advance_colliders mvee "
     "polar_clamped covariance_axes cut_at_cells cut_by_planes "
-    "quats_to_matrices matrices_to_quats quat_products link_states splat_bulk ssim"
+    "quats_to_matrices matrices_to_quats quat_products link_states "
+    "margin_counts find_faces face_elements splat_bulk ssim"
 ).split()
 
 

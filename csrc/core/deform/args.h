@@ -81,6 +81,37 @@ struct LinkStatesArgs {
   T* ratio;                   // [points, K]
 };
 
+// Flat Gaussians on the faces of cracks (faces.h); lengths of a fit are in pitches.
+template <typename T>
+struct FaceFit {
+  T layer, overlap, width, inset, rim, edge, narrowest, steep, thickness;
+};
+constexpr int kFaceFit = 9;
+
+template <typename T>
+struct FaceArgs {
+  int64_t count;  // of rows, or of elements
+  int64_t sites, points;
+  int near_count;  // K
+  FaceFit<T> fit;
+  const int64_t* rows;    // [count] sites
+  const int64_t* column;  // [count] neighbour of each element's face, K for a rim
+  const T* means;         // [sites, 3]
+  const int64_t* owner;   // [sites] own point of each
+  const T* pitch;         // [sites] distance between sites [m]
+  const T* outward;       // [sites, 3] to the skin
+  const T* depth;         // [sites] below the skin [m]
+  const int64_t* near;    // [points, K] neighbours of a point
+  const bool* opened;     // [points, K] which of them have moved away
+  const T* rest;          // [points, 3]
+  bool* has;              // [count, K + 1]
+  int64_t* rival;         // [count] the neighbour of the face, or of the one that a rim is of
+  T* out_means;           // [count, 3]
+  T* out_quats;           // [count, 4]
+  T* out_scales;          // [count, 3]
+  T* out_normals;         // [count, 3]
+};
+
 // Splats cut where cells of points border on each other, and Gaussians cut by planes (cut.h).
 template <typename T>
 struct CutAtCellsArgs {

@@ -1,6 +1,7 @@
 // CUDA kernels of the deformation ops: one thread per matrix or Gaussian.
 #include "core/deform/carry.h"
 #include "core/deform/cut.h"
+#include "core/deform/faces.h"
 #include "core/deform/link.h"
 #include "core/deform/turn.h"
 #include "cuda/deform/launch.h"
@@ -62,6 +63,19 @@ __global__ void link_states_kernel(LinkStatesArgs<T> a) {
 }
 
 template <typename T>
+__global__ void find_faces_kernel(FaceArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  const int columns = a.near_count + 1;
+  if (i < a.count * columns) a.has[i] = has_face(a, i / columns, static_cast<int>(i % columns));
+}
+
+template <typename T>
+__global__ void face_elements_kernel(FaceArgs<T> a) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < a.count) face_element(a, i);
+}
+
+template <typename T>
 __global__ void cut_at_cells_kernel(CutAtCellsArgs<T> a) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (i < a.count) gsf::cut_at_cells(a, i);
@@ -115,6 +129,17 @@ cudaError_t link_states(const LinkStatesArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, link_states_kernel<T>);
 }
 template <typename T>
+cudaError_t find_faces(const FaceArgs<T>& args, cudaStream_t stream) {
+  const int64_t pairs = args.count * (args.near_count + 1);
+  if (pairs == 0) return cudaSuccess;
+  find_faces_kernel<T><<<blocks_for<kFewThreads>(pairs), kFewThreads, 0, stream>>>(args);
+  return cudaGetLastError();
+}
+template <typename T>
+cudaError_t face_elements(const FaceArgs<T>& args, cudaStream_t stream) {
+  return launch(args, stream, face_elements_kernel<T>);
+}
+template <typename T>
 cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream) {
   return launch(args, stream, cut_at_cells_kernel<T>);
 }
@@ -139,6 +164,10 @@ template cudaError_t quat_products(const TurnArgs<float>&, cudaStream_t);
 template cudaError_t quat_products(const TurnArgs<double>&, cudaStream_t);
 template cudaError_t link_states(const LinkStatesArgs<float>&, cudaStream_t);
 template cudaError_t link_states(const LinkStatesArgs<double>&, cudaStream_t);
+template cudaError_t find_faces(const FaceArgs<float>&, cudaStream_t);
+template cudaError_t find_faces(const FaceArgs<double>&, cudaStream_t);
+template cudaError_t face_elements(const FaceArgs<float>&, cudaStream_t);
+template cudaError_t face_elements(const FaceArgs<double>&, cudaStream_t);
 template cudaError_t cut_at_cells(const CutAtCellsArgs<float>&, cudaStream_t);
 template cudaError_t cut_at_cells(const CutAtCellsArgs<double>&, cudaStream_t);
 template cudaError_t cut_by_planes(const CutByPlanesArgs<float>&, cudaStream_t);

@@ -32,6 +32,12 @@ template <typename T>
 cudaError_t link_states(const LinkStatesArgs<T>& args, cudaStream_t stream);
 
 template <typename T>
+cudaError_t find_faces(const FaceArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
+cudaError_t face_elements(const FaceArgs<T>& args, cudaStream_t stream);
+
+template <typename T>
 cudaError_t cut_at_cells(const CutAtCellsArgs<T>& args, cudaStream_t stream);
 
 template <typename T>

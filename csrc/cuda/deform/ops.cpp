@@ -16,6 +16,8 @@ struct DeformCuda {
   GSF_LAUNCH(matrices_to_quats)
   GSF_LAUNCH(quat_products)
   GSF_LAUNCH(link_states)
+  GSF_LAUNCH(find_faces)
+  GSF_LAUNCH(face_elements)
   GSF_LAUNCH(cut_at_cells)
   GSF_LAUNCH(cut_by_planes)
 };

@@ -4,6 +4,7 @@
 #include <cuda_runtime_api.h>
 
 #include "core/distance.h"
+#include "core/labels.h"
 #include "core/nearest.h"
 #include "core/spatial.h"
 
@@ -17,5 +18,8 @@ cudaError_t distance_pass(const DistanceArgs& a, cudaStream_t stream);
 template <typename T>
 cudaError_t trilinear(const TrilinearArgs<T>& a, cudaStream_t stream);
 cudaError_t value_noise(const ValueNoiseArgs& a, cudaStream_t stream);
+cudaError_t hashes(const HashesArgs& a, cudaStream_t stream);
+cudaError_t label_boxes(const LabelBoxesArgs& a, cudaStream_t stream);
+cudaError_t margin_counts(const MarginCountsArgs& a, cudaStream_t stream);
 
 }  // namespace gsf::cuda

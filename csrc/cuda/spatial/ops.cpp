@@ -15,6 +15,9 @@ struct SpatialCuda {
   GSF_LAUNCH(distance_pass)
   GSF_LAUNCH(trilinear)
   GSF_LAUNCH(value_noise)
+  GSF_LAUNCH(hashes)
+  GSF_LAUNCH(label_boxes)
+  GSF_LAUNCH(margin_counts)
 };
 
 }  // namespace

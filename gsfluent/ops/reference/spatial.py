@@ -140,3 +140,39 @@ def _hashed(node: Tensor, octave: int) -> Tensor:
         h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & _MASK
         parts.append((h ^ (h >> 16)).to(torch.float64) * (2.0 / 4294967296.0) - 1.0)
     return torch.stack(parts, dim=-1).to(torch.float32)
+
+
+def hashes(seed: Tensor, turns: Sequence[int]) -> Tensor:
+    """Values in -1 to 1 by a hash of 32 bits (:func:`gsfluent.ops.hashes`)."""
+    mask = 0xFFFFFFFF
+    salt = [(turn * 0x9E3779B1 + 0x2545F491) & mask for turn in turns]
+    h = (seed[..., None] ^ torch.tensor(salt, device=seed.device)) & mask
+    for factor in (0x7FEB352D, 0x846CA68B):
+        h = ((h ^ (h >> 16)) * factor) & mask
+    h = h ^ (h >> 16)
+    return h.double() * (2.0 / 4294967296.0) - 1.0
+
+
+def label_boxes(labels: Tensor, count: int) -> Tensor:
+    """First and last index of each label (:func:`gsfluent.ops.label_boxes`)."""
+    ends = []
+    for axis, size in enumerate(labels.shape):
+        steps = torch.arange(size).view([-1 if a == axis else 1 for a in range(3)])
+        there = [labels == label for label in range(count)]
+        ends.append([int(torch.where(t, steps, size).amin()) for t in there])
+        ends.append([int(torch.where(t, steps, -1).amax()) for t in there])
+    return torch.tensor(ends, dtype=torch.int32).T
+
+
+def margin_counts(
+    lead: Tensor, first: Tensor, second: Tensor, offset: Tensor, width: float
+) -> Tensor:
+    """Voxels of labels, and of bands (:func:`gsfluent.ops.margin_counts`)."""
+    now = lead.double() + (offset[first] - offset[second])
+    band = now.abs() < width
+    found = []
+    for label in range(len(offset)):
+        has = torch.where(now >= 0.0, first, second) == label
+        near = band & ((first == label) | (second == label))
+        found.append([int(has.sum()), int(near.sum())])
+    return torch.tensor(found).T

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import geometry
+from gsfluent.ops.faces import FaceFit, FaceSites, face_elements, find_faces
 from gsfluent.pipeline.cracks.sites import Sites
 
 
@@ -133,95 +133,27 @@ def find_elements(
     Returns:
         Their elements, sorted.
     """
-    owner, pitch = sites.owner[rows], sites.pitch[rows]
-    index, gone = near[owner], opened[owner]
-    middle, points = sites.means[rows], rest[index]
-    across = points - rest[owner][:, None]
-    width = across.norm(dim=2).clamp(min=1e-12)
-    normal = across / width[..., None]
-    own = (middle - rest[owner]).square().sum(dim=1, keepdim=True)
-    reach = ((points - middle[:, None]).square().sum(dim=2) - own) / (2.0 * width)
-    layer = fit.layer * pitch[:, None] * normal.abs().sum(dim=2)
-    m, k = (gone & (reach < layer)).nonzero().unbind(dim=1)
-    # Where a third point's cell begins the face has ended.
-    spot = middle[m] + reach[m, k, None] * normal[m, k]
-    third = (points[m] - spot[:, None]).norm(dim=2).amin(dim=1)
-    kept = third >= (rest[owner[m]] - spot).norm(dim=1) - fit.overlap * pitch[m]
-    m, k = m[kept], k[kept]
-    # Its nearest edge: the skin, or another face.
-    planes = torch.cat([normal[m], sites.outward[rows[m], None]], dim=1)
-    far = torch.where(gone, reach, torch.inf)[m].scatter(1, k[:, None], torch.inf)
-    far = torch.cat([far, sites.depth[rows[m], None]], dim=1)
-    tilt = (planes * normal[m, k][:, None]).sum(dim=2)
-    slope = (1.0 - tilt.square()).clamp(min=0.0).sqrt()
-    room = (far - reach[m, k][:, None] * tilt) / slope.clamp(min=_STEEP)
-    room, edge = torch.where(slope > _STEEP, room, torch.inf).min(dim=1)
-    toward = planes.gather(1, edge[:, None, None].expand(-1, 1, 3))[:, 0]
-    crust = sites.depth[rows[m]] < CRUST * sites.voxel[rows[m]]
-    color = torch.where(crust[:, None], sites.skin[rows[m]], sites.color[rows[m]])
-    faces = _elements(
-        sites,
-        rows[m],
-        near,
-        k,
-        normal[m, k],
-        reach[m, k].clamp(min=0.0),
-        toward,
-        room,
-        color,
-        0,
-        fit,
+    around = FaceSites(
+        sites.means, sites.owner, sites.pitch, sites.outward, sites.depth, near, opened, rest
     )
-    # The skin along the rim of a face: what the splats of the skin leave open.
-    outward = sites.outward[rows]
-    skin = sites.depth[rows] < fit.layer * pitch * outward.abs().sum(dim=1)
-    gap, best = torch.where(gone, reach, torch.inf).min(dim=1)
-    m = (skin & (gap < RIM * pitch)).nonzero()[:, 0]
-    k = best[m]
-    rims = _elements(
-        sites, rows[m], near, k, outward[m], sites.depth[rows[m]], normal[m, k],
-        gap[m].clamp(min=0.0), sites.skin[rows[m]], 1, fit,
-    )  # fmt: skip
-    return Elements.sorted([faces, rims])
-
-
-def _elements(
-    sites: Sites,
-    site: Tensor,
-    near: Tensor,
-    column: Tensor,
-    normal: Tensor,
-    reach: Tensor,
-    edge: Tensor,
-    room: Tensor,
-    color: Tensor,
-    kind: int,
-    fit: Fit,
-) -> Elements:
-    """Elements ``reach`` [m] away along ``normal``, narrowed where an edge is near.
-
-    ``room`` [m] is the way to the edge within the face, which lies toward ``edge``.
-    """
-    pitch, owner = sites.pitch[site], sites.owner[site]
-    means = sites.means[site] + (reach - fit.inset * pitch)[:, None] * normal
-    # First axis: in the face, toward the edge.
-    along = edge - (edge * normal).sum(dim=1, keepdim=True) * normal
-    flat = along.norm(dim=1) < _STEEP
-    reference = torch.zeros_like(normal).scatter_(1, normal.abs().argmin(1, keepdim=True), 1.0)
-    other = torch.linalg.cross(normal, reference)
-    first = torch.nn.functional.normalize(torch.where(flat[:, None], other, along), dim=1)
-    axes = torch.stack([first, torch.linalg.cross(normal, first), normal], dim=2)
-    width = fit.width * pitch
-    narrow = torch.minimum(width, torch.maximum(room / EDGE, NARROWEST * width))
-    narrow = torch.where(flat, width, narrow)
-    return Elements(
-        key=(site * near.shape[0] + near[owner, column]) * 2 + kind,
+    fits = FaceFit(
+        fit.layer, fit.overlap, fit.width, fit.inset, RIM, EDGE, NARROWEST, _STEEP, THICKNESS
+    )
+    # elements of the skin along the rim of a face: what the splats of the skin leave open
+    m, column = find_faces(rows, around, fits).nonzero().unbind(dim=1)
+    site, rim = rows[m], column == near.shape[1]
+    rival, means, quats, scales, normals = face_elements(site, column, around, fits)
+    owner = sites.owner[site]
+    crust = rim | (sites.depth[site] < CRUST * sites.voxel[site])
+    made = Elements(
+        key=(site * near.shape[0] + near[owner, rival]) * 2 + rim,
         site=site,
         owner=owner,
-        pair=owner * near.shape[1] + column,
+        pair=owner * near.shape[1] + rival,
         means=means,
-        quats=geometry.matrix_to_quaternion(axes),
-        scales=torch.stack([narrow, width, THICKNESS * pitch], dim=1),
-        color=color,
-        normals=normal,
+        quats=quats,
+        scales=scales,
+        color=torch.where(crust[:, None], sites.skin[site], sites.color[site]),
+        normals=normals,
     )
+    return made.select(made.key.argsort())

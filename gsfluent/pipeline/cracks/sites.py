@@ -28,6 +28,7 @@ MOST = 1_000_000
 """Largest number of sites of a scene; more would make a coarser lattice."""
 SKIN = 1.75
 """Sites within this many pitches of the skin know the colour of the skin."""
+_AT_ONCE = 1 << 20  # places that are looked at together
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,9 +111,10 @@ def _of_solid(solid: Solid, pitch: float) -> tuple[Tensor, ...]:
     counts = [math.ceil(size / step) for size in field.shape]
     axes = [(torch.arange(n, device=field.device) + 0.5) * step for n in counts]
     kept = []
-    for x in axes[0]:  # slab by slab: memory stays small for fine lattices
-        slab = torch.cartesian_prod(x[None], axes[1], axes[2])
-        kept.append(slab[sample(field, slab) > 0.0])
+    # some slabs at a time: memory stays small for fine lattices
+    for some in axes[0].split(max(1, _AT_ONCE // (counts[1] * counts[2]))):
+        slabs = torch.cartesian_prod(some, axes[1], axes[2])
+        kept.append(slabs[sample(field, slabs) > 0.0])
     place = torch.cat(kept)
     depth = sample(field, place)
     half = 0.5 * torch.eye(3, device=field.device)
@@ -149,5 +151,5 @@ def matter_colors(solid: Solid, place: Tensor, means: Tensor) -> Tensor:
         return solid.gaussians.colors()[nearest[:, 0]].clamp(max=1.0)
     weight = solid.occupancy.to(torch.float32)
     total = sample(weight, place).clamp(min=1e-6)
-    parts = [sample(weight * solid.color[..., i], place) / total for i in range(3)]
-    return torch.stack(parts, dim=1)
+    fields = torch.stack([weight * solid.color[..., i] for i in range(3)])
+    return (sample(fields, place) / total).T.contiguous()

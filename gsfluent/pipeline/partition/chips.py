@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.pipeline.partition.field import Box, Field, Span, grown
 
 UNEVEN = 0.45
@@ -189,12 +190,7 @@ def hashed(seed: Tensor, turn: int) -> Tensor:
 
 def hashes(seed: Tensor, turns: Sequence[int]) -> Tensor:
     """Uniform values in -1 to 1, float64, from whole numbers below 2^32, [..., turns]."""
-    salt = [(turn * 0x9E3779B1 + 0x2545F491) & _MASK for turn in turns]
-    h = (seed[..., None] ^ torch.tensor(salt, device=seed.device)) & _MASK
-    for factor in (0x7FEB352D, 0x846CA68B):
-        h = ((h ^ (h >> 16)) * factor) & _MASK
-    h = h ^ (h >> 16)
-    return h.double() * (2.0 / 4294967296.0) - 1.0
+    return ops.hashes(seed, turns)
 
 
 def _turns(four: Tensor) -> Tensor:

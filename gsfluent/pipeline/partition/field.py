@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
+
 
 class Field(NamedTuple):
     """A label's share of its surroundings in its box of the grid; 0.5 at a face.
@@ -60,20 +62,9 @@ Span = tuple[tuple[int, int, int], tuple[slice, slice, slice]]
 
 def boxes(labels: Tensor, count: int) -> list[Box | None]:
     """The box of every label, of voxels [X, Y, Z]; None for those without a voxel."""
-    where = (labels >= 0).nonzero()
-    label = labels[where[:, 0], where[:, 1], where[:, 2]].long()
-    ends = []
-    for axis in range(3):
-        size = labels.shape[axis]
-        there = torch.zeros(count * size, dtype=torch.bool, device=labels.device)
-        there = there.index_fill_(0, label * size + where[:, axis], True).view(count, size)
-        steps = torch.arange(size, device=labels.device)
-        ends += [
-            torch.where(there, steps, size).amin(dim=1),
-            torch.where(there, steps, -1).amax(dim=1),
-        ]
     # one look for all: each waits for a GPU
-    found = [[(a, i), (b, j), (c, k)] for a, i, b, j, c, k in torch.stack(ends, dim=1).tolist()]
+    ends = ops.label_boxes(labels, count).tolist()
+    found = [[(a, i), (b, j), (c, k)] for a, i, b, j, c, k in ends]
     return [box if box[0][1] >= 0 else None for box in found]
 
 

@@ -171,14 +171,9 @@ def keep_volumes(
     bar = torch.clamp(0.5 * VOLUME * wanted, min=1.0)
     width, best = 0.2, (math.inf, offset)
     gain, last = torch.full_like(offset, 0.6), torch.zeros_like(offset)
-    # of every pair: whom it belongs to, and whose faces it is near
-    names = torch.cat([a, b, a + count, b + count])
     for _ in range(_PASSES):
-        now = _margin(lead, offset, a, b)
-        band = now.abs() < width
-        told = torch.cat([now >= 0, now < 0, band, band]).long()
-        found = torch.zeros(2 * count, dtype=torch.int64, device=a.device)
-        volume, near = found.index_add_(0, names, told).cpu().view(2, count)
+        counts = ops.margin_counts(lead, a, b, offset.to(lead.device), width)
+        volume, near = counts.cpu()
         error = alone + volume - wanted
         worst = float((error.abs() / bar).amax())
         if worst < best[0]:
