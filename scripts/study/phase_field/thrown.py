@@ -131,7 +131,9 @@ def melon(cells: int, seed: int, height: float, device: str) -> tuple[dict[str, 
         device: Where.
     """
     fruit = materials.get("fruit.watermelon")
-    ware = fruit.override(law="phase_field", length=MELON_LENGTH, prefer="strength")
+    ware = fruit.override(
+        law="phase_field", length=MELON_LENGTH, prefer="strength", split="spectral"
+    )
     trial = dataclasses.replace(MELON, material=ware, height=height)
     dx = 2.0 * max(trial.half) / cells
     sim = Simulate(dx=dx, seed=seed, repair=False, splats=False, device=device)
