@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from struck import kalthoff
+from thrown import THROWS, floor, melon
 
 from gsfluent import ops
 from gsfluent.fracturebench.registry import judge
@@ -30,7 +31,7 @@ GLASS = (1e9, 0.2, 1000.0)
 STRIP_TOUGHNESS = 10.0
 BEAM = (20.8e9, 0.3, 2400.0)
 BEAM_TOUGHNESS = 500.0
-Done = tuple[dict[str, Any], Scene, Run]
+Done = tuple[dict[str, Any], Scene | None, Run | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -266,4 +267,13 @@ def jobs(quick: bool, device: str) -> list[Job]:
                 f"{count} cells, {0.1 * length:.2g} mm, {split}, {model}", (count / 32.0) ** 3,
                 lambda c=count, w=length, s=split, m=model: kalthoff(c, s, m, 1e-4 * w, device),
             )  # fmt: skip
+    for name in THROWS:
+        add("floor", name, name, 300.0, lambda n=name: floor(n, 4 if quick else 6, device))
+    for height in (0.75,) if quick else (0.4, 0.75):
+        for count in (20,) if quick else (20, 30, 40):
+            for seed in range(1 if quick else 8):
+                add(
+                    "melon", f"{height:g}_{count}_{seed}", f"{height:g} m", (count / 10.0) ** 4,
+                    lambda c=count, s=seed, h=height: melon(c, s, h, device),
+                )  # fmt: skip
     return made

@@ -28,8 +28,8 @@ from gsfluent.scene.scene import Scene
 
 PICTURE = Path(__file__).resolve().parents[3] / "docs" / "images" / "phase_field_laws.jpg"
 LAWS = ("nacc", "phase_field")
-FPS, SECONDS = 1000, 0.016
-WALL = 8.0
+FPS, SECONDS = 400, 0.04
+WALL = 12.0
 """Thickness of both [cells]: what is thinner than the cracks are wide is punched through."""
 MOMENTS = (0.15, 0.35, 0.6, 1.0)
 
@@ -67,7 +67,7 @@ def turned(angle: float, axis: int) -> Frame:
     return Frame(turn, torch.zeros(3), 1.0)
 
 
-def pane(cells: int, law: str) -> tuple[Scene, float]:
+def pane(cells: int, law: str, speed: float) -> tuple[Scene, float]:
     """A pane of 0.3 m that is thrown down on a corner, and the size of a cell."""
     dx = 0.3 / cells
     half = (0.15, 0.1, 0.5 * WALL * dx)
@@ -75,12 +75,12 @@ def pane(cells: int, law: str) -> tuple[Scene, float]:
     glass = materials.glass.override(law=law)
     scene = Scene()
     lean = Frame(turned(0.5, 1).rotation @ turned(0.4, 0).rotation, torch.zeros(3), 1.0)
-    scene.add(body, glass, frame=lean, velocity=(0.0, 0.0, -8.0), angular_velocity=(4.0, 3.0, 0.0))
+    scene.add(body, glass, frame=lean, velocity=(0.0, 0.0, -speed))
     scene.drop(0.01)
     return scene, dx
 
 
-def bowl(cells: int, law: str) -> tuple[Scene, float]:
+def bowl(cells: int, law: str, speed: float) -> tuple[Scene, float]:
     """A bowl of 0.16 m that is thrown down on its bottom, and the size of a cell."""
     dx = 0.16 / cells
     wall = WALL * dx
@@ -92,16 +92,16 @@ def bowl(cells: int, law: str) -> tuple[Scene, float]:
     body = solid((0.08, 0.08, 0.08), inside, 0.5 * dx)
     scene = Scene()
     ware = materials.ceramic.override(law=law)
-    scene.add(body, ware, frame=turned(0.25, 1), velocity=(0.0, 0.0, -9.0))
+    scene.add(body, ware, frame=turned(0.25, 1), velocity=(0.0, 0.0, -speed))
     scene.drop(0.005)
     return scene, dx
 
 
 def run(
-    make: Any, cells: int, law: str, device: str
+    make: Any, cells: int, law: str, speed: float, device: str
 ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, Any]]:
     """Positions and pieces of every frame, and figures of the last."""
-    scene, dx = make(cells, law)
+    scene, dx = make(cells, law, speed)
     simulation = Simulate(dx=dx, device=device)(scene, fps=FPS, seconds=SECONDS)
     places, pieces = [], []
     for frame in simulation:
@@ -144,6 +144,7 @@ def main() -> int:
     )
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--cells", type=int, default=64, help="along the longest side")
+    parser.add_argument("--speed", type=float, default=2.5, help="of the throw [m/s]")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--only", default="pane,bowl", metavar="BODY,...")
     parser.add_argument("--enter", action="store_true", help="the picture becomes that of the docs")
@@ -158,7 +159,7 @@ def main() -> int:
     shown: dict[tuple[str, str], Any] = {}
     for body in args.only.split(","):
         for law in LAWS:
-            shown[body, law] = run(made[body], args.cells, law, args.device)
+            shown[body, law] = run(made[body], args.cells, law, args.speed, args.device)
             sys.stderr.write(f"{body} {law}: {json.dumps(shown[body, law][2])}\n")
     told = {f"{body} {law}": value[2] for (body, law), value in shown.items()}
     (args.out / "laws.json").write_text(json.dumps(told, indent=1), encoding="utf-8")

@@ -36,17 +36,19 @@ def work(job: Job, out: Path, device: str) -> None:
     """Run a job and write its files."""
     begin, spent = time.perf_counter(), time.process_time()
     found, scene, run = job.work()
-    assert run.damage is not None
+    if scene is not None and run is not None:
+        found |= {"points": scene.count, "steps": run.steps, "dx": scene.dx}
     found |= {
-        "test": job.test, "setting": job.setting, "points": scene.count, "steps": run.steps,
-        "dx": scene.dx, "wall": time.perf_counter() - begin, "cpu": time.process_time() - spent,
+        "test": job.test, "setting": job.setting, "wall": time.perf_counter() - begin,
+        "cpu": time.process_time() - spent,
         "threads": torch.get_num_threads(), "machine": machine(device),
     }  # fmt: skip
-    with atomic_path(out / f"{job.name}.npz") as path, path.open("wb") as file:
-        np.savez_compressed(
-            file, x=scene.x[:, :2].astype(np.float32),
-            damage=(255.0 * run.damage[-1]).astype(np.uint8), dx=scene.dx,
-        )  # fmt: skip
+    if scene is not None and run is not None and run.damage is not None:
+        with atomic_path(out / f"{job.name}.npz") as path, path.open("wb") as file:
+            np.savez_compressed(
+                file, x=scene.x[:, :2].astype(np.float32),
+                damage=(255.0 * run.damage[-1]).astype(np.uint8), dx=scene.dx,
+            )  # fmt: skip
     with atomic_path(out / f"{job.name}.json") as path:
         path.write_text(json.dumps(found), encoding="utf-8")
 
