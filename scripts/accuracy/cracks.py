@@ -14,6 +14,7 @@ in --cache, so a second call scores in seconds. Colours are unlit, over white.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import sys
@@ -69,7 +70,9 @@ class Truth:
     def __init__(self, broken: Broken, solid: TrueSolid, index: int, views: list[Camera]) -> None:
         at = broken.moment(index).position
         self.position = solid.moved(at, bent=True)
-        size = f"{views[0].width}x{views[0].height}_{len(solid.rest)}"
+        # of other cameras than these there are other pictures
+        seen = hashlib.sha256(b"".join(v.viewmat.numpy().tobytes() for v in views)).hexdigest()[:8]
+        size = f"{views[0].width}x{views[0].height}_{len(solid.rest)}_{seen}"
         stored = broken.folder / f"truth_{index:03d}_{size}.npz"
         names = list(TruePicture.__annotations__)
         if not stored.exists():

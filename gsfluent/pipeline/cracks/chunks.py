@@ -456,8 +456,9 @@ class Chunks:
         position, rest, spacing = points.position, self.base.matter.rest, self.base.links.spacing
         drive = self._drives & self._may
         rigid = motions(
-            self._chunk[drive], self._regions, rest[drive], position[:count][drive], spacing[drive]
-        )
+            self._chunk[drive], self._regions, rest[drive], position[:count][drive],
+            spacing[drive], self._stiff[drive],
+        )  # fmt: skip
         turn = rigid.turn[self._chunk].to(points.map)
         bodies = len(self._scene.bodies)
         small = chips(self._chunk, self._may & ~self._gone, drive, self._regions, bodies)

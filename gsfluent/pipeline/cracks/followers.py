@@ -20,8 +20,11 @@ WIDE = 1.5
 """Width of the blend of neighbouring points where matter is broken, in point spacings: what is
 left of the crack band is rougher than a face."""
 HELD, YIELDS = 1.5, 3.0
-"""Root mean square way [spacings] of points from the rigid motion of their chunk up to which what
-is stiff is drawn rigid, and from which it is drawn as its points are."""
+"""Median way [spacings] of points from the rigid motion of their chunk up to which what is stiff is
+drawn rigid, and from which it is drawn as its points are."""
+STRAY, ROUNDS = 1.5, 3
+"""Way [spacings] from which on a point of something stiff has strayed from its chunk, and how often
+these are left out anew."""
 STIFF = 3e-3
 """Strain at which a material breaks below which its pieces are never seen to bend."""
 _FINE = 2.0**20
@@ -210,28 +213,38 @@ class Motions(NamedTuple):
 def held(rigid: Motions, chunk: Tensor, rest: Tensor, now: Tensor, spacing: Tensor) -> Tensor:
     """How far each chunk is held in shape, 0 to 1, [C].
 
-    All the way while its points are where its rigid motion takes them, but for some bending; what
-    has been crushed, or was never one piece, is not. Sums go in whole numbers: they have no order.
+    All the way while half of its points are where its rigid motion takes them; what has been
+    crushed, or was never one piece, is not.
 
     Args:
         rigid: The motions.
-        chunk: Of firm points, int64 [D].
+        chunk: Of some points, int64 [D].
         rest: Where they were at rest [m], [D, 3].
         now: Where they are [m], [D, 3].
         spacing: Between them [m], [D].
     """
-    off = (rigid.placed(chunk, rest) - now.double()) / spacing.double()[:, None]
-    square = (off.square().sum(dim=1).clamp(max=_FINE) * _FINE).round().long()
-    count = rigid.turn.shape[0]
-    total = square.new_zeros(count).index_add_(0, chunk, square).double() / _FINE
-    many = torch.bincount(chunk, minlength=count).clamp(min=1).double()
-    return ((YIELDS - (total / many).sqrt()) / (YIELDS - HELD)).clamp(0.0, 1.0)
+    off = (rigid.placed(chunk, rest) - now.double()).norm(dim=1) / spacing.double()
+    half = _medians(off, chunk, rigid.turn.shape[0])
+    return ((YIELDS - half) / (YIELDS - HELD)).clamp(0.0, 1.0)
 
 
-def motions(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor) -> Motions:
+def _medians(values: Tensor, chunk: Tensor, count: int) -> Tensor:
+    """Medians of values [D] by chunk, int64 [D], of ``count`` chunks; 0 where one has none."""
+    order = values.argsort(stable=True)
+    order = order[chunk[order].argsort(stable=True)]
+    many = torch.bincount(chunk, minlength=count)
+    middle = many.cumsum(0) - many + (many - 1).clamp(min=0) // 2
+    sorted_ = torch.cat([values[order], values.new_zeros(1)])
+    return torch.where(many > 0, sorted_[middle], 0.0)
+
+
+def motions(
+    chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor, stiff: Tensor
+) -> Motions:
     """Rigid motions of chunks: the best fit (Kabsch 1976).
 
-    Sums go in whole numbers, which have no order.
+    What is stiff is one thing, whatever was crushed at its rim: its fit leaves out what is more
+    than :data:`STRAY` from the last one, a few times, but never more than half of the points.
 
     Args:
         chunk: Of each point that drives one, int64 [D].
@@ -239,7 +252,25 @@ def motions(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tenso
         rest: Where the points were at rest [m], [D, 3].
         now: Where they are [m], [D, 3].
         spacing: Between them [m], [D]; one value for a chunk.
+        stiff: Those of what is stiff, bool [D]; one value for a chunk.
     """
+    found = _fitted(chunk, count, rest, now, spacing)
+    rows = stiff.nonzero()[:, 0]
+    if rows.numel() == 0:
+        return found
+    chunk, rest, now, spacing = (values[rows] for values in (chunk, rest, now, spacing))
+    some = torch.bincount(chunk, minlength=count) > 0
+    for _ in range(ROUNDS):
+        off = (found.placed(chunk, rest) - now.double()).norm(dim=1) / spacing.double()
+        keep = off <= _medians(off, chunk, count).clamp(min=STRAY)[chunk]
+        better = _fitted(chunk[keep], count, rest[keep], now[keep], spacing[keep])
+        pairs = zip(better, found, strict=True)
+        found = Motions(*(torch.where(some.view(-1, *[1] * (b.dim() - 1)), a, b) for a, b in pairs))
+    return found
+
+
+def _fitted(chunk: Tensor, count: int, rest: Tensor, now: Tensor, spacing: Tensor) -> Motions:
+    """The best fits to points; sums go in whole numbers, which have no order."""
     scale = spacing.double()[:, None]
     edge = scale.new_zeros(count, 1).index_copy(0, chunk, scale)
     many = torch.bincount(chunk, minlength=count).clamp(min=1).double()[:, None]
