@@ -130,6 +130,7 @@ class Fit(Verb):
       gsfluent fit shot.yaml --force press.csv --learn block.young_modulus -o out
       gsfluent fit shot.yaml --masks films/ --cameras capture/ --learn melon.young_modulus -o out
       gsfluent fit shot.yaml --points track.npz --laws elastic,von_mises,fluid -o out
+      gsfluent fit shot.yaml --pieces pieces.csv --learn cup.tensile_strength --cells 32 -o out
       gsfluent fit shot.yaml --guidance sds --model zeroscope/ --prompt "jelly falls" --learn ...
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
@@ -155,14 +156,20 @@ class Fit(Verb):
     """Films of masks: a folder for each camera, named as its image, with a picture per frame."""
     cameras: Path | None = None
     """Of --masks: COLMAP model or transforms.json in the frame of the splats; they stand still."""
+    pieces: Path | None = None
+    """The pieces of what broke: a table with a column mass [kg], and perhaps x, y, z [m]."""
+    dust: float | None = None
+    """Of --pieces: the share of the mass that belongs to none."""
+    seeds: int = 8
+    """Of --pieces: simulations of each candidate, whose mean is compared."""
     guidance: Literal["sds"] | None = None
     """Instead of what was seen: a text and a video model's score distillation. No measurement."""
     model: Path | None = None
     """Of --guidance: folder of a text-to-video pipeline of diffusers."""
     prompt: str | None = None
     """Of --guidance: what the film shows."""
-    rounds: int = 60
-    """Of --guidance: steps; each takes a run for every number, and one."""
+    rounds: int | None = None
+    """Of --guidance: steps, 60; each takes a run for every number, and one. Of --pieces: 12."""
     sigma: float | None = None
     """Standard deviation of what was seen [m, N; of a pixel none]."""
     fps: float | None = None
@@ -170,7 +177,8 @@ class Fit(Verb):
     starts: int = 4
     """Starts of the search."""
     cells: int = 8
-    """Cells along the longest side of the largest object; give thin things more."""
+    """Cells along the longest side of the largest object; give thin things more. Of --pieces they
+    are those of the shots that follow."""
     grids: Literal[1, 2] = 2
     """2: a grid twice as fine sets the motion of the coarser one right."""
     jobs: int | None = None
@@ -195,8 +203,16 @@ class Fit(Verb):
 
                 return guide_to(
                     shot, self.out, self.learn, device=self.torch_device(), reporter=report,
-                    model=self.model, prompt=self.prompt, rounds=self.rounds,
-                    **self.given("cells", "seed"),
+                    model=self.model, prompt=self.prompt,
+                    **self.given("rounds", "cells", "seed"),
+                )  # fmt: skip
+            if self.pieces is not None:
+                from gsfluent.fit.broken import pieces_to
+
+                return pieces_to(
+                    shot, self.out, self.learn, existing(self.pieces, "--pieces", folder=False),
+                    device=self.torch_device(), reporter=report,
+                    **self.given("dust", "seeds", "rounds", "cells", "jobs", "on", "seed"),
                 )  # fmt: skip
             return fit_to(
                 shot, self.out, self.learn, device=self.torch_device(), reporter=report,

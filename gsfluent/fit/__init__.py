@@ -2,4 +2,4 @@
 
 from gsfluent._lazy import room
 
-__getattr__, __dir__, __all__ = room(__name__, job="fit_to", guided="guide_to")
+__getattr__, __dir__, __all__ = room(__name__, job="fit_to", guided="guide_to", broken="pieces_to")

@@ -21,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.pipeline.cracks.stage": ("Repair",),
         "gsfluent.pipeline.render.stage": ("Render",),
         "gsfluent.pipeline.carrying.stage": ("Carry",),
+        "gsfluent.pipeline.fit.breaks": ("FitPieces",),
         "gsfluent.pipeline.fit.guidance": ("Guide",),
         "gsfluent.pipeline.fit.stage": ("Fit",),
         "gsfluent.pipeline.fit.video_prior": ("VideoPrior",),

@@ -1,4 +1,4 @@
-"""What was seen of a motion, for :class:`gsfluent.pipeline.Fit`: points, clouds, masks, a force."""
+"""What was seen, for :class:`gsfluent.pipeline.Fit`: points, clouds, masks, a force, pieces."""
 
 from gsfluent._lazy import lazy
 
@@ -8,5 +8,6 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.targets.points": ("Points", "Clouds"),
         "gsfluent.targets.masks": ("Masks",),
         "gsfluent.targets.force": ("Force",),
+        "gsfluent.targets.pieces": ("Pieces",),
     },
 )

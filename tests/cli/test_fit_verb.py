@@ -244,3 +244,29 @@ def test_a_text_and_a_video_model_guide(
     )
     entry = yaml.safe_load((tmp_path / "fitted.yaml").read_text())["objects"]["it"]
     assert entry["young_modulus"] == pytest.approx(young)
+
+
+def test_pieces_show_how_strong_a_thing_is(
+    thrown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One generation with two seeds, in processes; taken up again without a simulation."""
+    shot = yaml.safe_load((thrown / "shot.yaml").read_text())
+    shot["objects"]["it"] = {"material": "chocolate"}
+    shot["events"][1]["velocity"] = [0.0, 0.0, -5.0]
+    (tmp_path / "shot.yaml").write_text(yaml.safe_dump(shot))
+    (tmp_path / "pieces.csv").write_text("mass,x,y,z\n2.0,0,0,0.1\n1.0,0.2,0,0.1\n")
+    out = tmp_path / "out"
+    words = ["fit", str(tmp_path / "shot.yaml"), "--pieces", str(tmp_path / "pieces.csv"), "-o"]
+    words += [str(out), "--seeds", "2", "--rounds", "1", "--cells", "4", "--jobs", "1"]
+    words += ["--learn", "it.young_modulus", "--dust", "0.1", "--device", "cpu"]
+    assert main(words) == 0
+    assert "it.young_modulus" in capsys.readouterr().out
+    values = json.loads((out / "fit.json").read_text())
+    assert values["target"] == "pieces" and values["runs"] == 12 and len(values["tried"]) == 5
+    before = {p: p.stat().st_mtime_ns for p in (out / "search").rglob("*.json")}
+    assert main(words) == 0
+    assert json.loads((out / "fit.json").read_text()) == values
+    assert {p for p, at in before.items() if p.stat().st_mtime_ns == at}
+    (tmp_path / "pieces.csv").write_text("weight\n1\n")
+    assert main(words) == 2
+    assert "mass,x,y,z" in capsys.readouterr().err

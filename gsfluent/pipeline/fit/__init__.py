@@ -4,9 +4,10 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    stage="Fit Found",
+    breaks="Break FitPieces run_break",
     guidance="Guide",
-    video_prior="VideoPrior",
-    task="Task run_task",
     laws="plain",
+    stage="Fit Found",
+    task="Task run_task",
+    video_prior="VideoPrior",
 )

@@ -2,8 +2,8 @@
 
 Levenberg 1944, Marquardt 1963; residuals beyond three standard deviations count by their size
 alone (Huber 1964). Bands: the inverse of ``J^T W J`` and the prior where the motion fits to its
-noise, else the clustered sandwich of Liang and Zeger 1986 by frame, since what the model gets wrong
-it gets wrong for all points of a frame alike.
+noise, else the jackknife by frames (Tukey 1958), since what the model gets wrong it gets wrong for
+all points of a frame alike.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ SETTLED = 1e-3
 """A step that lowers the cost by less than this part of it ends a stage."""
 UNSURE = 0.25
 """Of what a finer grid changes in a frame, the part that is not believed."""
+TELLING, QUIET = 30, 0.05
+"""Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
 CORRECTIONS = 4
 """How often at most the change by a finer grid is seen anew, on all frames."""
 SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -45,13 +47,15 @@ class Fitted:
 
     Attributes:
         free: Free coordinates.
-        cost: Half the sum of squares, Huber's beyond three, prior included.
+        cost: Minus the logarithm of the likelihood: half the sum of squares, Huber's beyond three,
+            that of the prior, and the logarithms of the deviations that were taken.
         rms: Root of the mean square of the residuals, in standard deviations.
         information: ``J^T W J`` of the motion alone, [P, P].
         covariance: With the prior; of what does not fit the sandwich, [P, P].
-        per_frame: Root mean square residual of each frame.
+        per_frame: Root mean square residual of each frame, in standard deviations.
         runs: Of the solver.
         strain: Largest strain of any point at the last frame.
+        count: How many residuals.
     """
 
     free: Array
@@ -62,6 +66,7 @@ class Fitted:
     per_frame: list[float]
     runs: int
     strain: float
+    count: int = 0
 
 
 @dataclasses.dataclass
@@ -174,6 +179,22 @@ class Problem:
                 size = float(np.mean(shift[frame == k] ** 2))
                 self.trust[k] = (1.0 + UNSURE**2 * size) ** -0.5
 
+    def reweigh(self, per_frame: Sequence[float], count: int) -> None:
+        """Take what a frame was missed by for its noise, where it has enough to tell.
+
+        What the model gets wrong grows after contact; a free flight is foretold to a fraction of
+        the noise that was believed, and what it shows of velocities need not suffer from the rest.
+
+        Args:
+            per_frame: Root mean square residuals.
+            count: How many residuals there are.
+        """
+        if count < TELLING * len(per_frame):
+            return
+        for k, size in enumerate(per_frame):
+            if size > 0.0:
+                self.trust[k] = 1.0 / max(size, QUIET)
+
     def dt(self, free: Array) -> float:
         """A time step for a linearisation about them."""
         return self.forward.step(self.fixed | self.unknowns.values(free))
@@ -263,20 +284,21 @@ def search(
         size = len(unknowns)
         return Fitted(free, 0.0, 0.0, np.zeros((size, size)), np.diag(unknowns.spread**2), [],
                       problem.forward.runs - runs, float(at.motion.strain))  # fmt: skip
+    own = scale / problem.trust[at.frame]
+    raw = residual * own
     return Fitted(
         free=free,
-        cost=here,
-        rms=scale * float(np.sqrt(np.mean(residual**2))),
+        cost=here + float(np.log(own).sum()),
+        rms=float(np.sqrt(np.mean(raw**2))),
         information=_spread(normal, rows, len(unknowns)),
         covariance=_covariance(jacobian, weight * residual, weight, at.frame, prior, rows),
         per_frame=[
-            scale * float(np.sqrt(np.mean(residual[at.frame == k] ** 2)))
-            if (at.frame == k).any()
-            else 0.0
+            float(np.sqrt(np.mean(raw[at.frame == k] ** 2))) if (at.frame == k).any() else 0.0
             for k in range(frames)
         ],
         runs=problem.forward.runs - runs,
         strain=float(at.motion.strain),
+        count=len(raw),
     )
 
 
@@ -367,12 +389,14 @@ def _covariance(
 ) -> Array:  # fmt: skip
     """Covariance of the free coordinates; see the head of the file."""
     bread = np.linalg.inv((jacobian * weight[:, None]).T @ jacobian + np.diag(prior[rows]))
-    groups = np.unique(frame)
-    sums = np.stack([jacobian[frame == k].T @ score[frame == k] for k in groups])
-    sums = sums - sums.mean(axis=0)  # the prior's pull is no noise
-    more = len(groups) / max(len(groups) - 1, 1)
-    sandwich = bread @ (more * sums.T @ sums) @ bread
-    ratio = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(bread), 1.0))
+    without = []
+    for k in np.unique(frame):
+        part = jacobian[frame == k]
+        left = np.linalg.inv(bread) - (part * weight[frame == k, None]).T @ part
+        without.append(np.linalg.solve(left, part.T @ score[frame == k]))
+    gone = np.stack(without) - np.mean(without, axis=0)
+    jackknife = (len(gone) - 1) / len(gone) * gone.T @ gone
+    ratio = np.sqrt(np.maximum(np.diag(jackknife) / np.diag(bread), 1.0))
     whole = np.diag(1.0 / prior)
     whole[np.ix_(rows, rows)] = bread * ratio[:, None] * ratio[None, :]
     return whole
@@ -407,6 +431,7 @@ def in_stages(
     All frames at once get stuck where the first rebound is wrong. With a finer grid each stage is a
     defect correction: what that grid changes is seen at the last values, and the search goes on
     with it on the coarse grid. How far the change goes on, beyond the finer grid, is learnt.
+    Finally every frame counts by what it is missed by.
 
     Args:
         problem: What is searched; with a finer grid its numbers have :data:`FINER`.
@@ -426,12 +451,14 @@ def in_stages(
     counts = sorted({max(2, round(share * frames)) for share in shares})
     for count in counts:
         last = settle and count == counts[-1]
-        for _ in range(CORRECTIONS if last and finer else 1):
+        for number in range(CORRECTIONS if last else 1):
             if finer is not None:
                 problem.refine(finer, free, count)
+            if number and found is not None:
+                problem.reweigh(found.per_frame, found.count)
             found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
             moved, free = float(np.abs(found.free - free).max()), found.free
-            if moved < 10.0 * CLOSE:
+            if number and moved < 10.0 * CLOSE:
                 break
     assert found is not None
     return dataclasses.replace(found, runs=problem.forward.runs - runs)

@@ -23,7 +23,14 @@ from gsfluent.pipeline.fit.parameters import (
 )
 from gsfluent.pipeline.fit.points import FieldTask, divided, run_field
 from gsfluent.pipeline.fit.solve import SHARES
-from gsfluent.pipeline.fit.task import Runner, Task, one_by_one, run_task, unknowns_of
+from gsfluent.pipeline.fit.task import (
+    EXTRAPOLATION,
+    Runner,
+    Task,
+    one_by_one,
+    run_task,
+    unknowns_of,
+)
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -32,8 +39,10 @@ from gsfluent.targets.target import Target
 
 Array = NDArray[np.float64]
 
-LEFT = 0.1
-"""Of what the finer grid moves a number by, the part that may be left: a standard deviation."""
+LEFT = EXTRAPOLATION[1]
+"""Of what the finer grid moves a number by, the part that may be left: a standard deviation. How
+far the change goes on is learnt as one share for all; that of a number is its own, and off by as
+much as was believed of it beforehand."""
 NUISANCE = (OFFSET, FINER)
 """What is learnt of the grid, not of the scene."""
 CORRELATED = 0.9
@@ -244,7 +253,8 @@ def conclude(
     free = np.asarray(found["free"])
     covariance = np.asarray(found["covariance"])
     grid = of_the_grid(unknowns, free, found["information"])
-    sd = np.sqrt(np.diag(covariance) + (LEFT * grid) ** 2)
+    went = max(abs(float(unknowns.values(free).get(FINER, 1.0))), 0.5)
+    sd = np.sqrt(np.diag(covariance) + (LEFT * grid / went) ** 2)
     slope = np.abs(unknowns.slope(free))
     share = np.clip(np.diag(covariance) / unknowns.spread**2, 0.0, 1.0)
     deviation = np.sqrt(np.diag(covariance))
