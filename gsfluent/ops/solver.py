@@ -144,8 +144,9 @@ class Solver(SolverState):
         irreversible: Whether broken points lose their cohesion for good.
         flip: Share of their own velocity and affine matrix, less what the nodes would give back by
             themselves, that points keep in a step (FLIP; the rest is APIC), in [0, 1); rates of
-            strain keep its root. With ``1 - 2 cfl`` shorter steps lose as much in the same time as those of ``cfl`` 0.5
-            (docs/theory/mpm.md). 0 costs nothing. Not beside law ``phase_field``.
+            strain keep its root. With ``1 - 2 cfl`` shorter steps lose as much in the same time as
+            those of ``cfl`` 0.5 (docs/theory/mpm.md). 0 costs nothing. Not beside law
+            ``phase_field``.
         frame: Velocity of the grid [m/s], which changes no law of motion but what the grid loses.
             With colliders 0. Default: without them that of the matter, each body by its mass, so
             that what happens does not depend on who watches (docs/theory/mpm.md). Positions and
