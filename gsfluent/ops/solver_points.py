@@ -7,6 +7,7 @@ whichever, and the first build brings every point to the rank that owns its home
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import torch
@@ -191,18 +192,18 @@ class Lot:
     blocks: Tensor
     widths: dict[str, int]
 
-    @property
+    @functools.cached_property
     def index(self) -> Tensor:
         """Where each stands in the order of loading, int64 [n]."""
         return self.buffers.id[self.begin : self.end].long()
 
-    @property
+    @functools.cached_property
     def owners(self) -> Tensor:
         """Block and field of each, int64 [n, 4]."""
         place = torch.arange(self.begin, self.end, device=self.starts.device)
         return self.blocks[torch.searchsorted(self.starts, place, right=True) - 1].long()
 
-    @property
+    @functools.cached_property
     def words(self) -> Tensor:
         """Cell and row of each, int64 [n]."""
         if "meta" in self.widths:

@@ -264,26 +264,54 @@ class SolverState:
         Raises:
             InputError: No such values.
         """
+        self._known(name)
+        for lot in self._lots():
+            yield lot.index, self._of(lot, name)
+
+    def values(self, *names: str) -> tuple[Tensor, ...]:
+        """Several values in the order of loading, where the points were given: one look for all.
+
+        Args:
+            names: As :meth:`chunks` takes them.
+
+        Raises:
+            InputError: No such values.
+        """
+        for name in names:
+            self._known(name)
+        out: dict[str, Tensor] = {}
+        for lot in self._lots():
+            index = lot.index.to(self.outside)
+            for name in names:
+                values = self._of(lot, name).to(self.outside)
+                if name not in out:
+                    out[name] = values.new_empty((self.count, *values.shape[1:]))
+                out[name][index] = values
+        return tuple(out[name] for name in names)
+
+    def holds(self, name: str) -> bool:
+        """Whether there are such values: not every solver has a deformation, or viscous springs."""
+        return name in _VALUES - ({"deformation", "viscous"} - self._widths.keys())
+
+    def _known(self, name: str) -> None:
         missing = {"deformation", "viscous"} - self._widths.keys()
-        if name not in _VALUES or name in missing:
+        if not self.holds(name):
             raise InputError(
                 f"Solver.chunks: there is no {name!r} here",
                 hint=f"one of {', '.join(sorted(_VALUES - missing))}",
             )
-        of = getattr(self, f"_{name}_of", None)
+
+    def _lots(self) -> Iterator[points.Lot]:
         for b in self._stores():
-            for lot in points.lots(b, self._widths):
-                yield lot.index, lot.rows(name) if of is None else of(lot)
+            yield from points.lots(b, self._widths)
+
+    def _of(self, lot: points.Lot, name: str) -> Tensor:
+        of = getattr(self, f"_{name}_of", None)
+        value: Tensor = lot.rows(name) if of is None else of(lot)
+        return value
 
     def _read(self, name: str) -> Tensor:
-        """Values in the order of loading, where the points were given."""
-        out: Tensor | None = None
-        for index, values in self.chunks(name):
-            if out is None:
-                out = values.new_empty((self.count, *values.shape[1:]), device=self.outside)
-            out[index.to(out.device)] = values.to(out.device)
-        assert out is not None  # there is a point
-        return out
+        return self.values(name)[0]
 
     @property
     def position(self) -> Tensor:

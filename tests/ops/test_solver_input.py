@@ -10,6 +10,7 @@ import torch
 from solver_scenes import scene
 
 from gsfluent import ops
+from gsfluent.errors import InputError
 
 NAN = math.nan
 
@@ -85,3 +86,17 @@ def test_a_sphere_that_is_none_is_refused_between_calls() -> None:
     rows[0, 0] = 1.0  # a sphere without a radius
     with pytest.raises(ValueError, match="set_colliders"):
         solver.set_colliders(rows)
+
+
+def test_values_of_one_look_are_those_of_many() -> None:
+    given = scene(cells=4)
+    solver = ops.Solver(**given)
+    solver.advance(steps=5)
+    names = ("position", "body", "velocity", "affine", "strain", "alpha", "peak", "stress")
+    for name, value in zip(names, solver.values(*names), strict=True):
+        assert solver.holds(name) and torch.equal(value, getattr(solver, name)), name
+    assert not torch.equal(solver.values("position")[0], given["position"])
+    assert not solver.holds("deformation") and not solver.holds("colour")
+    with pytest.raises(InputError, match="deformation"):
+        solver.values("position", "deformation")
+    assert solver.values() == ()

@@ -394,17 +394,14 @@ class Resident:
 
     def read(self) -> Points:
         """See :class:`Engine`."""
-        s = self._solver
-        return Points(
-            self._position(),
-            s.velocity,
-            s.affine,
-            s.strain,
-            s.alpha,
-            s.peak,
-            s.deformation,
-            s.viscous,
-        )
+        s, names = self._solver, list(Points._fields)
+        if self._where is not None:
+            names.remove("position")
+        names = [name for name in names if s.holds(name)]
+        found = dict(zip(names, s.values(*names), strict=True))
+        self._where = found.pop("position", self._where)
+        assert self._where is not None  # it was there, or has been asked for
+        return Points(position=self._where, **{"deformation": None, **found})
 
 
 def _most_crowded(position: Tensor, field: Tensor, dx: float) -> Tensor:
