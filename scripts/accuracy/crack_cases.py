@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import demo, geometry, materials, ops
-from gsfluent.data import Gaussians, Solid
+from gsfluent.data import SPRAY, Gaussians, Solid
 from gsfluent.demo.catalogue import OBJECTS
 from gsfluent.lab.truth.fracture_pictures import TrueSolid
 from gsfluent.lab.truth.interiors import known_interior
@@ -304,6 +304,17 @@ def repaired(broken: Broken, moment: Moment, method: str) -> Drawn:
     return Drawn(made.gaussians, made.groups, shown)
 
 
+def pieces(broken: Broken, moment: Moment) -> Drawn:
+    """Chunks without the grains of their dust, which the truth has none of."""
+    whole = repaired(broken, moment, "chunks")
+    labels = whole.gaussians.labels
+    if labels is None:
+        return whole
+    kept = labels != SPRAY
+    groups = None if whole.groups is None else whole.groups[kept]
+    return Drawn(whole.gaussians.select(kept), groups, whole.shown)
+
+
 def drawn(broken: Broken, history: CrackHistory, cracks: Cracks | None, points: Points) -> Repaired:
     """The splats of a moment."""
     if cracks is None:
@@ -316,4 +327,6 @@ def drawn(broken: Broken, history: CrackHistory, cracks: Cracks | None, points: 
 METHODS: dict[str, Callable[[Broken, Moment], Drawn]] = {
     "raw": raw,
     "raw-total": lambda b, m: raw(b, m, total=True),
-} | {name: functools.partial(repaired, method=name) for name in ("mvee", "gap", "chunks")}
+    **{name: functools.partial(repaired, method=name) for name in ("mvee", "gap", "chunks")},
+    "pieces": pieces,
+}

@@ -246,8 +246,8 @@ def sheet(pictures: list[Tensor], titles: list[str], path: Path) -> None:
 
 
 COLUMNS = {
-    "psnr": ("PSNR image", ".2f"),
-    "rigid": ("rigid truth", ".2f"),
+    "psnr": ("bent truth [dB]", ".2f"),
+    "rigid": ("rigid truth [dB]", ".2f"),
     "psnr_inside": ("silhouette", ".2f"),
     "ssim": ("SSIM", ".3f"),
     "lpips": ("LPIPS", ".3f"),
@@ -266,7 +266,7 @@ def table(name: str, found: dict[str, Any]) -> Iterator[str]:
         f"frames {', '.join(map(str, found['frames']))}, {found['cameras']} cameras"
     )
     yield ""
-    yield "| method | " + " | ".join(COLUMNS[k][0] for k in columns) + " | over raw | rigid |"
+    yield "| method | " + " | ".join(COLUMNS[k][0] for k in columns) + " | over raw, bent | rigid |"
     yield "| --- " * (len(columns) + 3) + "|"
     base = found["methods"].get("raw")
     for method, row in everything.items():

@@ -6,7 +6,10 @@ import json
 import sys
 
 import pytest
+import torch
 from loaded_scripts import load_script
+
+from gsfluent.data import SPRAY, Gaussians
 
 
 @pytest.fixture
@@ -43,6 +46,18 @@ def test_methods_are_told_apart_and_work_is_kept(script, tmp_path, monkeypatch, 
     assert rows["sum of the volumes, voxels lost"] == "0 | 0"
     assert float(rows["overlap of pieces [%]"].split(" | ")[1]) < 5.0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.*")} == kept
+
+
+def test_pieces_are_chunks_without_grains(monkeypatch):
+    cases = load_script("accuracy/crack_cases")
+    splats = Gaussians.from_colors(torch.rand(5, 3), torch.full((5,), 0.01), torch.rand(5, 3))
+    labels = torch.tensor([0, SPRAY, 2, SPRAY, 0], dtype=torch.int32)
+    groups = torch.arange(5, dtype=torch.int32)
+    whole = cases.Drawn(splats.replace(labels=labels), groups, splats.means)
+    monkeypatch.setattr(cases, "repaired", lambda *_: whole)
+    found = cases.METHODS["pieces"](None, None)
+    assert torch.equal(found.gaussians.means, splats.means[[0, 2, 4]])
+    assert found.groups.tolist() == [0, 2, 4] and found.shown is splats.means
 
 
 def test_flat_cuts_have_the_heights_that_were_asked_for(script):

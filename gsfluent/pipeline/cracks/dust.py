@@ -51,7 +51,7 @@ THINNEST = 0.02
 1 / 255, and hundreds of wide puffs that end there one behind the other would show an edge."""
 PALE = 0.35
 """How far mist is paler than what it is of: it scatters light many times."""
-MOST = 60_000
+MOST = 40_000
 """Chips of a body, about; where its dust would have more, the smallest ones are larger."""
 SCATTER = 0.2
 """How far grains scatter about their point, as a share of the way that it has gone from its chunk:

@@ -20,8 +20,9 @@ WIDE = 1.5
 """Width of the blend of neighbouring points where matter is broken, in point spacings: what is
 left of the crack band is rougher than a face."""
 HELD, YIELDS = 1.5, 3.0
-"""Median way [spacings] of points from the rigid motion of their chunk up to which what is stiff is
-drawn rigid, and from which it is drawn as its points are."""
+"""Way [spacings] from the rigid motion of their chunk within which nine tenths of the points are
+where what is stiff is drawn rigid, and from which on it is drawn as its points are."""
+MOST = 0.9
 STRAY, ROUNDS = 1.5, 3
 """Way [spacings] from which on a point of something stiff has strayed from its chunk, and how often
 these are left out anew."""
@@ -213,8 +214,8 @@ class Motions(NamedTuple):
 def held(rigid: Motions, chunk: Tensor, rest: Tensor, now: Tensor, spacing: Tensor) -> Tensor:
     """How far each chunk is held in shape, 0 to 1, [C].
 
-    All the way while half of its points are where its rigid motion takes them; what has been
-    crushed, or was never one piece, is not.
+    All the way while nine tenths of its points are where its rigid motion takes them; what has
+    been crushed, or was never one piece, is not: drawn rigid it would stand in the floor.
 
     Args:
         rigid: The motions.
@@ -224,18 +225,19 @@ def held(rigid: Motions, chunk: Tensor, rest: Tensor, now: Tensor, spacing: Tens
         spacing: Between them [m], [D].
     """
     off = (rigid.placed(chunk, rest) - now.double()).norm(dim=1) / spacing.double()
-    half = _medians(off, chunk, rigid.turn.shape[0])
-    return ((YIELDS - half) / (YIELDS - HELD)).clamp(0.0, 1.0)
+    most = _quantiles(off, chunk, rigid.turn.shape[0], MOST)
+    return ((YIELDS - most) / (YIELDS - HELD)).clamp(0.0, 1.0)
 
 
-def _medians(values: Tensor, chunk: Tensor, count: int) -> Tensor:
-    """Medians of values [D] by chunk, int64 [D], of ``count`` chunks; 0 where one has none."""
+def _quantiles(values: Tensor, chunk: Tensor, count: int, share: float) -> Tensor:
+    """Quantiles of values [D] by chunk, int64 [D], of ``count`` chunks; 0 where one has none."""
     order = values.argsort(stable=True)
     order = order[chunk[order].argsort(stable=True)]
     many = torch.bincount(chunk, minlength=count)
-    middle = many.cumsum(0) - many + (many - 1).clamp(min=0) // 2
+    # a whole number of thousandths, so that no device rounds another way
+    place = many.cumsum(0) - many + (many - 1).clamp(min=0) * round(1000 * share) // 1000
     sorted_ = torch.cat([values[order], values.new_zeros(1)])
-    return torch.where(many > 0, sorted_[middle], 0.0)
+    return torch.where(many > 0, sorted_[place], 0.0)
 
 
 def motions(
@@ -262,7 +264,7 @@ def motions(
     some = torch.bincount(chunk, minlength=count) > 0
     for _ in range(ROUNDS):
         off = (found.placed(chunk, rest) - now.double()).norm(dim=1) / spacing.double()
-        keep = off <= _medians(off, chunk, count).clamp(min=STRAY)[chunk]
+        keep = off <= _quantiles(off, chunk, count, 0.5).clamp(min=STRAY)[chunk]
         better = _fitted(chunk[keep], count, rest[keep], now[keep], spacing[keep])
         pairs = zip(better, found, strict=True)
         found = Motions(*(torch.where(some.view(-1, *[1] * (b.dim() - 1)), a, b) for a, b in pairs))

@@ -144,17 +144,18 @@ def test_shards_of_what_is_stiff_are_never_seen_to_bend(material: str) -> None:
 
 
 def test_a_crushed_rim_does_not_turn_a_stone() -> None:
-    """A third of the points of one half have gone sideways; the others say where it is."""
+    """Some points of one half have gone far; the others say where it is."""
     bound = binding(material="ceramic")
     rest, spacing = bound.matter.rest, bound.matter.spacing[0]
     points = moment(bound, halves(bound), apart(bound, 0.2))
     wanted = points.position.clone()
     right = (rest[:, 0] > 0.0).nonzero()[:, 0]
-    rim = right[rest[right, 0].argsort()[: len(right) // 3]]
+    some = len(right) // 12
+    rim = right[rest[right, 0].argsort()[:some]]
     position = wanted.clone()
-    position[rim, 1] += 6.0 * spacing
+    position[rim, 1] += 20.0 * spacing
     cracks = Repair().begin(bound).step(points._replace(position=position))
-    firm = right[rest[right, 0].argsort()[len(right) // 3 :]]
+    firm = right[rest[right, 0].argsort()[some:]]
     off = (cracks.points.position[firm] - wanted[firm]).norm(dim=1)
     assert float(off.max()) < 0.05 * spacing
 
