@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -32,7 +33,9 @@ def polar_clamped(deformation: Tensor, lo: float = 0.3, hi: float = 2.0) -> tupl
         TypeError: ``deformation`` is not a float32 or float64 tensor.
         ValueError: Wrong shape, or not ``0 < lo <= hi``.
 
-    Gradient: none. One-sided Jacobi, 6 fixed sweeps (Hestenes 1958); see csrc/core/svd3.h.
+    Gradient: deformation, of both results; zero where a stretch is held at a bound, and where the
+    rotation itself jumps (a turn over) that of a hair away. One-sided Jacobi, 6 fixed sweeps
+    (Hestenes 1958); see csrc/core/svd3.h.
     """
     check_tensor("polar_clamped", "deformation", deformation, shape=("N", 3, 3))
     if not (0.0 < lo <= hi and math.isfinite(hi)):
@@ -339,7 +342,55 @@ fakes(
     ),
     cut_by_planes=lambda m, *rest: tuple(m.new_empty((len(m), n)) for n in (3, 4, 3)),
 )
-no_gradient("polar_clamped: no gradient with respect to deformation", "polar_clamped")
+
+
+def _polar_setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(inputs[0])
+    ctx.bounds = inputs[1:]
+
+
+def _polar_backward(ctx: Any, g_turn: Tensor | None, g_shape: Tensor | None) -> Any:
+    """For ``U f(S) V^T``, with ``M = U^T dF V``: entries ``((a + b) M_ij + (a - b) M_ji) / 2``.
+
+    ``a = (f_j - f_i) / (s_j - s_i)``, the slope of f where both are one, and
+    ``b = (f_j + f_i) / (s_j + s_i)``; on the diagonal the slope. This map is its own adjoint.
+    """
+    (given,) = ctx.saved_tensors
+    lo, hi = ctx.bounds
+    finite = torch.isfinite(given).all(dim=2).all(dim=1)
+    eye = torch.eye(3, dtype=given.dtype, device=given.device)
+    u, s, vh = torch.linalg.svd(torch.where(finite[:, None, None], given, eye))
+    flip_u, flip_v = torch.linalg.det(u).sign(), torch.linalg.det(vh).sign()
+    ones = torch.ones_like(flip_u)
+    u = u * torch.stack([ones, ones, flip_u], dim=1)[:, None, :]
+    vh = vh * torch.stack([ones, ones, flip_v], dim=1)[:, :, None]
+    s = s * torch.stack([ones, ones, flip_u * flip_v], dim=1)
+    apart, both = s[:, None, :] - s[:, :, None], s[:, None, :] + s[:, :, None]
+    small = torch.finfo(s.dtype).eps ** 0.5 * s[:, :1, None].clamp(min=1e-30)
+    both = torch.where(both.abs() < small, small, both)
+    found = torch.zeros_like(given)
+    for grad, value, slope in (
+        (g_turn, torch.ones_like(s), torch.zeros_like(s)),
+        (g_shape, s.clamp(lo, hi), ((s > lo) & (s < hi)).to(s)),
+    ):
+        if grad is None:
+            continue
+        inner = u.mT @ grad @ vh.mT
+        near = 0.5 * (slope[:, None, :] + slope[:, :, None])
+        rise = (value[:, None, :] - value[:, :, None]) / torch.where(apart == 0, 1.0, apart)
+        a = torch.where(apart.abs() < small, near, rise)
+        b = (value[:, None, :] + value[:, :, None]) / both
+        moved = 0.5 * ((a + b) * inner + (a - b) * inner.mT)
+        index = torch.arange(3, device=s.device)
+        moved[:, index, index] = slope * inner[:, index, index]
+        found = found + u @ moved @ vh
+    return torch.where(finite[:, None, None], found, 0.0), None, None
+
+
+torch.library.register_autograd(
+    "gsfluent::polar_clamped", _polar_backward, setup_context=_polar_setup
+)
 no_gradient(
     "axes of Gaussians: no gradient", "carry_place", "covariance_axes", "carry_axes",
     "cut_at_cells", "cut_by_planes", "link_states",

@@ -92,12 +92,6 @@ def test_registration() -> None:
         assert torch.equal(got, want)
 
 
-def test_gradient_is_refused() -> None:
-    f = torch.randn(2, 3, 3, requires_grad=True)
-    with pytest.raises(NotImplementedError, match="no gradient"):
-        polar_clamped(f)[1].sum().backward()
-
-
 def test_errors_name_the_argument() -> None:
     with pytest.raises(TypeError, match="deformation must be float32 or float64"):
         polar_clamped(torch.zeros(2, 3, 3, dtype=torch.float16))
@@ -125,3 +119,24 @@ def test_what_a_row_gives_does_not_depend_on_its_place(mixed: Tensor, dtype: tor
         polar_clamped(given), polar_clamped(given.flip(0)[:-3].contiguous()), strict=True
     ):
         assert torch.equal(again, got.flip(0)[:-3])
+
+
+@pytest.mark.parametrize("bounds", [(0.05, 20.0), (0.8, 1.3)])
+def test_gradient_is_that_of_differences(bounds: tuple[float, float]) -> None:
+    """Free and clamped stretches; of two and of three that are one only the free are smooth."""
+    u, v = random_rotations(4), random_rotations(4)
+    s = torch.tensor([[1.9, 1.1, 0.4], [1.25, 1.0, 0.9], [1.6, 1.5, 1.4], [0.7, 0.5, 0.3]])
+    given = ((u * s.double()[:, None, :]) @ v.mT).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: polar_clamped(f, *bounds), given)
+    same = (random_rotations(3) * torch.tensor([1.1, 1.1, 1.1])).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: polar_clamped(f, *bounds), same)
+
+
+def test_gradient_of_a_turned_over_map_and_of_none() -> None:
+    u, v = random_rotations(1), random_rotations(1)
+    turned = ((u * torch.tensor([1.5, 1.0, -0.4])) @ v.mT).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: polar_clamped(f, 0.2, 3.0), turned)
+    broken = torch.eye(3, dtype=torch.float64)[None] * math.nan
+    broken.requires_grad_()
+    (slope,) = torch.autograd.grad(polar_clamped(broken)[0].sum(), broken)
+    assert torch.equal(slope, torch.zeros(1, 3, 3, dtype=torch.float64))
