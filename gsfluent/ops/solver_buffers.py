@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import torch
@@ -256,12 +257,12 @@ def real_as_word(real: Tensor) -> Tensor:
 def empty_buffers(device: torch.device, real: torch.dtype) -> Buffers:
     """Buffers without points, blocks, materials or optional parts."""
 
+    @functools.cache
     def zeros(*shape: int, dtype: torch.dtype = real) -> Tensor:
         return torch.zeros(shape, dtype=dtype, device=device)
 
-    values = {}
-    for field in dataclasses.fields(Buffers):
-        values[field.name] = zeros(0)
+    # what has no element is the same for all: most of them would be made for nothing
+    values = {field.name: zeros(0) for field in dataclasses.fields(Buffers)}
     whole = ("id", "entry", "place", "meta", "law", "home_start0", "home_count0", "home_start1",
              "home_count1", "parent", "cut", "object", "slot_given", "home_rank", "home_place",
              "damage_slots", "damage_homes", "damage_counts")  # fmt: skip

@@ -1,4 +1,4 @@
-"""Count the calls of torch that the repair of cracks makes in a shot, by function.
+"""Count the calls of torch that a thread of `simulate` makes in a shot, by function.
 
 A call of torch takes as long on a GPU whatever it works on, as long as that is little. So what a
 frame costs there is what it asks for, and that is the same on every machine:
@@ -6,7 +6,8 @@ frame costs there is what it asks for, and that is the same on every machine:
     gsfluent demo -o out
     python scripts/stages/calls.py out/shot.yaml -o out
 
-The stages before `simulate` are taken from the folder where they are done.
+Those of the repair of cracks are counted, or with `--thread solver` those of the thread that moves
+the matter. The stages before `simulate` are taken from the folder where they are done.
 """
 
 from __future__ import annotations
@@ -25,16 +26,18 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import gsfluent
 from gsfluent.cli import main as gsfluent_main
 from gsfluent.pipeline.cracks.chunks import Chunks
+from gsfluent.pipeline.simulate.stage import Simulation
 
 HOME = str(Path(gsfluent.__file__).parent)
+THREADS = {"repair": (Chunks, "step"), "solver": (Simulation, "advance")}
 
 
 class Counted(TorchDispatchMode):
-    """Counts calls for every function of gsfluent that is under way."""
+    """Counts calls for every function of gsfluent that is under way, or for the innermost."""
 
-    def __init__(self, into: collections.Counter[str]) -> None:
+    def __init__(self, into: collections.Counter[str], own: bool) -> None:
         super().__init__()
-        self.into = into
+        self.into, self.own = into, own
 
     def __torch_dispatch__(
         self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: Any = None
@@ -44,6 +47,8 @@ class Counted(TorchDispatchMode):
             code = frame.f_code
             if code.co_filename.startswith(HOME):
                 names.add(f"{Path(code.co_filename).stem}.{code.co_qualname}")
+                if self.own:
+                    break
             frame = frame.f_back  # type: ignore[assignment]
         self.into.update(names)
         return func(*args, **(kwargs or {}))
@@ -53,21 +58,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("shot", help="a shot")
     parser.add_argument("-o", "--output", required=True, help="its folder")
+    parser.add_argument("--thread", choices=sorted(THREADS), default="repair", help="whose calls")
+    parser.add_argument("--own", action="store_true", help="count for the innermost function only")
     parser.add_argument("--rows", type=int, default=20, help="functions shown (default 20)")
     options = parser.parse_args()
     for stage in ("simulate", "render"):
         shutil.rmtree(Path(options.output) / "stages" / stage, ignore_errors=True)
     counts: collections.Counter[str] = collections.Counter()
     frames = 0
-    step = Chunks.step
+    owner, method = THREADS[options.thread]
+    step = getattr(owner, method)
 
-    def counted(self: Chunks, *args: Any, **kwargs: Any) -> Any:
+    def counted(self: Any, *args: Any, **kwargs: Any) -> Any:
         nonlocal frames
         frames += 1
-        with Counted(counts):
+        with Counted(counts, options.own):
             return step(self, *args, **kwargs)
 
-    Chunks.step = counted  # type: ignore[method-assign]
+    setattr(owner, method, counted)
     torch.set_num_threads(1)
     sys.argv = ["gsfluent", "run", options.shot, "-o", options.output]
     status = gsfluent_main()
