@@ -90,6 +90,7 @@ class DamagePass {
   bool find_active(const HomePass<T>& pass) {
     const SolverClock& c = *s_.clock;
     number_.assign(c.slots, kNoPart);
+    extent_.resize(c.slots);
     std::atomic<bool> any{false};
     parallel_for(c.homes, kHomeGrain, [&](int64_t begin, int64_t end) {
       for (int64_t h = begin; h < end; ++h) {
@@ -141,13 +142,45 @@ class DamagePass {
     return true;
   }
 
+  // Nodes [lo, hi) of a slot that particles touch, on each axis.
+  struct Extent {
+    int8_t lo[3], hi[3];
+  };
   void mark_matter(const Box& box, const int32_t* neighbour) {
-    for (int i = window_block(box.lo[0]); i <= window_block(box.hi[0] - 1); ++i)
-      for (int j = window_block(box.lo[1]); j <= window_block(box.hi[1] - 1); ++j)
-        for (int k = window_block(box.lo[2]); k <= window_block(box.hi[2] - 1); ++k) {
-          const int32_t slot = neighbour[(i * 3 + j) * 3 + k];
-          if (slot >= 0 && slot < s_.clock->slots && number_[slot] == 0) number_[slot] = kMatter;
-        }
+    int lo[3][3], hi[3][3];  // [axis][block of the window]
+    for (int axis = 0; axis < 3; ++axis)
+      for (int block = 0; block < 3; ++block) {
+        const int first = 4 * block - 3;  // window_block(first) is the first to be `block`
+        lo[axis][block] = std::max<int>(box.lo[axis], first) - first;
+        hi[axis][block] = std::min<int>(box.hi[axis], first + 4) - first;
+      }
+    for (int n = 0; n < kNeighbours; ++n) {
+      const int block[3] = {n / 9, n / 3 % 3, n % 3};
+      bool touched = true;
+      for (int axis = 0; axis < 3; ++axis)
+        touched = touched && lo[axis][block[axis]] < hi[axis][block[axis]];
+      const int32_t slot = neighbour[n];
+      if (!touched || slot < 0 || slot >= s_.clock->slots || number_[slot] < 0) continue;
+      if (number_[slot] != kMatter) extent_[slot] = Extent{{4, 4, 4}, {0, 0, 0}};
+      number_[slot] = kMatter;
+      for (int axis = 0; axis < 3; ++axis) {
+        int8_t &l = extent_[slot].lo[axis], &h = extent_[slot].hi[axis];
+        l = std::min<int8_t>(l, static_cast<int8_t>(lo[axis][block[axis]]));
+        h = std::max<int8_t>(h, static_cast<int8_t>(hi[axis][block[axis]]));
+      }
+    }
+  }
+  // f(local index) for the nodes of an active slot that particles touch; of one colour, or of all
+  // if that is below 0.
+  template <typename F>
+  void for_each_node(int64_t row, int colour, const F& f) const {
+    const Extent& e = extent_[slots_[row]];
+    for (int i = e.lo[0]; i < e.hi[0]; ++i)
+      for (int j = e.lo[1]; j < e.hi[1]; ++j) {
+        const int along = local_index(i, j, 0), step = colour < 0 ? 1 : 2;
+        const int first = e.lo[2] + (colour >= 0 && node_colour(along + e.lo[2]) != colour);
+        for (int k = first; k < e.hi[2]; k += step) f(along + k);
+      }
   }
 
   using Sums = double __attribute__((vector_size(8 * kDamageSums)));
@@ -263,7 +296,7 @@ class DamagePass {
       for (int64_t b = begin; b < end; ++b) {
         int32_t face[6];  // slots beyond the faces
         for (int f = 0; f < 6; ++f) face[f] = around(slots_[b])[face_block(f)];
-        for (int local = 0; local < kBlockNodes; ++local) {
+        for_each_node(b, -1, [&](int local) {
           const int64_t n = b * kBlockNodes + local;
           const Sums& node = nodes_[n];
           Edge& e = edge_[n];
@@ -284,7 +317,7 @@ class DamagePass {
           field_[n] = now.value;
           e.right = now.right;
           e.inverse = now.inverse;
-        }
+        });
       }
     });
   }
@@ -294,15 +327,14 @@ class DamagePass {
     for (int sweep = 0; sweep < 2 * kSweeps; ++sweep)
       parallel_for(count, 8, [&](int64_t begin, int64_t end) {
         for (int64_t b = begin; b < end; ++b)
-          for (int local = 0; local < kBlockNodes; ++local) {
-            if (node_colour(local) != sweep % 2) continue;
+          for_each_node(b, sweep % 2, [&](int local) {
             const Edge& e = edge_[b * kBlockNodes + local];
-            if (e.inverse == 0.0) continue;
+            if (e.inverse == 0.0) return;
             double sum = e.right;
             for (int f = 0; f < 6; ++f) sum += e.weight[f] * field_[e.near[f]];
             double& d = field_[b * kBlockNodes + local];
             d = relaxed(d, sum, e.inverse);
-          }
+          });
       });
   }
 
@@ -364,6 +396,7 @@ class DamagePass {
   std::vector<int32_t> around_;          // [slots, 27]
   std::vector<int32_t> homes_[kColors];  // homes that take part, by colour
   std::vector<int32_t> number_;          // [slots] row of an active slot, or one of these
+  std::vector<Extent> extent_;           // [slots]
   std::vector<int32_t> slots_;           // active slots
   std::vector<Sums> nodes_;
   std::vector<Edge> edge_;
