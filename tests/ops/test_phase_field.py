@@ -11,7 +11,7 @@ from law_states import KAPPA, MU, cast, rotate, rotations, states, strained
 from phase_scenes import DX, assert_kept, plates, row, stepped
 from torch import Tensor
 
-from gsfluent import _core, ops
+from gsfluent import ops
 from gsfluent.materials.phase_field import GRID_ENERGY, MODELS, SPLITS
 from gsfluent.ops.damage import solve_drive
 from gsfluent.ops.plasticity import LAWS
@@ -129,6 +129,17 @@ def test_broken_matter_forgets_what_it_has_opened() -> None:
     assert torch.equal(kept, wide)
 
 
+@pytest.mark.parametrize("split", list(SPLITS))
+def test_what_broken_matter_forgets_makes_no_energy(split: str) -> None:
+    strain = strained(20000, 1.5)
+    given = {"law": LAW, "params": row(1.0, split)}
+    alpha = torch.zeros(20000, dtype=torch.float64)
+    kept = ops.return_mapping(strain, alpha, still(20000), **given)[0]
+    before, after = (ops.elastic_energy(e, **given) for e in (strain, kept))
+    assert float(((kept - strain).abs().amax(dim=1) > 1e-6).double().mean()) > 0.3
+    assert (after <= before * (1.0 + 1e-9)).all()
+
+
 def test_a_turned_state_gives_a_turned_stress() -> None:
     strain, alpha, increment = states("phase_field", 500)
     q = rotations(500)
@@ -143,13 +154,14 @@ def test_a_turned_state_gives_a_turned_stress() -> None:
 @pytest.mark.parametrize("split", list(SPLITS))
 def test_core_of_one_point(split: str) -> None:
     """Uniaxial extension, by hand: J and the isochoric part in closed form."""
+    core = pytest.importorskip("gsfluent._core", reason="built without gsfluent._core (pybind11)")
     code = float(SPLITS[split])
     stretch = 1.01
     strain = torch.tensor([stretch**2 - 1.0, 0, 0, 0, 0, 0], dtype=torch.float64).numpy()
-    m = _core.float64.Material(
+    m = core.float64.Material(
         mu=MU, kappa=KAPPA, strength=500.0, cohesion=0.3, hardening=0.04, damage=code
     )
-    got = _core.float64.return_mapping(strain, -1.0, still(1)[0].numpy(), 9, m)
+    got = core.float64.return_mapping(strain, -1.0, still(1)[0].numpy(), 9, m)
     g = (1.0 - 1e-4) * 0.49 + 1e-4
     if split == "spectral":
         h = math.log(stretch)
@@ -420,6 +432,37 @@ def test_the_resident_solver_has_the_same_bits_in_any_order_and_threads() -> Non
 
 def test_a_break_keeps_momentum_and_makes_no_energy() -> None:
     assert_kept(plates(torch.float32, split="volumetric"))
+
+
+@pytest.mark.parametrize(("sign", "share"), [(-1.0, 1.0), (1.0, reference.RESIDUAL)])
+def test_a_crack_that_is_pressed_shut_bears_all_and_opens_with_what_is_left(
+    sign: float, share: float
+) -> None:
+    """A broken block between walls, evenly pressed or stretched: what the walls push back."""
+    given = plates(torch.float64, split="volumetric")
+    x, n = given["position"], given["mass"].shape[0]
+    inside = ((x > 0.0) & (x < DX * torch.tensor([14.0, 5.0, 5.0]).double())).all()
+    assert bool(inside)
+    walls = torch.zeros(6, 16, dtype=torch.float64)
+    for axis, far in enumerate((14.0, 5.0, 5.0)):
+        for side, at in ((0, 0.0), (1, far * DX)):
+            wall = walls[2 * axis + side]
+            wall[0], wall[1], wall[3 + axis], wall[6 + axis], wall[9] = 0, 1, at, 1 - 2 * side, 0
+    stretch = 1.0 + sign * 1e-3
+    strain = torch.zeros(n, 6, dtype=torch.float64)
+    strain[:, :3] = stretch**2 - 1.0
+    pushes = []
+    for peak in (-1.0, 0.05):  # whole, broken
+        change = {"velocity": torch.zeros(n, 3).double(), "strain": strain, "colliders": walls}
+        rows = given["params"].clone()
+        rows[:, 2] *= 1e6  # nothing more breaks
+        solver = ops.Solver(
+            **(given | change | {"params": rows, "peak": torch.full((n,), peak).double()}), dt=1e-5
+        )
+        solver.advance(steps=4)  # before anything moves
+        pushes.append(solver.impulse[0, 0] - solver.impulse[1, 0])
+    assert float(pushes[0]) * sign < 0.0
+    assert float(pushes[1] / pushes[0]) == pytest.approx(share, rel=0.01)
 
 
 def test_the_solver_says_what_it_cannot_do() -> None:

@@ -19,6 +19,7 @@ inline constexpr double kDriveMax = 1e4;            // of H / psi_t: 1 - d is 1e
 // Broken matter forgets what it has opened and sheared beyond these, as torn liquid does: the
 // stiffness that is left must not pull across an open crack.
 inline constexpr double kBrokenVolumeMax = 0.44;                // J^2 - 1 of J = 1.2
+inline constexpr double kBrokenLogMax = 0.36464311358790924;    // its logarithm
 inline constexpr double kBrokenIsochoric = 0.8855488076521759;  // J^(-2/3) there
 inline constexpr double kBrokenShearMax = 0.5;                  // |d|
 constexpr bool isochoric_is(double isochoric, double j2m1) {
@@ -143,6 +144,13 @@ GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym
   LawResult<T> out{s.e, s.e, alpha, false, s.guarded};
   if (m.cohesion >= T(kBrokenDamage)) {
     if (s.j2m1 > T(kBrokenVolumeMax)) {
+      if (split_of(m) == kSplitSpectral) {
+        // Or the other principal strains would be pressed as these are let go, and make energy.
+        // Squared: d is no logarithm, and falls more slowly than one.
+        const T kept = T(kBrokenLogMax) / log1p(s.j2m1);
+        s.d = (kept * kept) * s.d;
+        s.n *= kept * kept;
+      }
       s.j2m1 = T(kBrokenVolumeMax);
       out.plastic = true;
     }

@@ -44,7 +44,15 @@ class DamagePass {
   }
 
   // Again after each build.
-  void plan() { around_.clear(); }
+  void plan() {
+    const int64_t slots = s_.clock->slots;
+    keys_.resize(slots);
+    for (int64_t i = 0; i < slots; ++i) {
+      const int32_t* b = s_.slot_coord + 4 * i;
+      keys_[i] = block_key(b[0], b[1], b[2], b[3]);
+    }
+    around_.assign(kNeighbours * slots, kUnknown);
+  }
 
   // One solve; peaks of the points after it.
   void run(const HomePass<T>& pass) {
@@ -57,26 +65,18 @@ class DamagePass {
 
  private:
   bool is_phase(int64_t p) const { return s_.law[s_.row_of(s_.meta[p])] == kPhaseField; }
-  // Slots around each slot, -1 where there is none; looked up once after a build.
-  void look_around() {
-    const int64_t slots = s_.clock->slots;
-    if (!around_.empty() || slots == 0) return;
-    std::vector<uint64_t> keys(slots);
-    const auto key = [&](int64_t slot, int n) {
-      const int32_t* b = s_.slot_coord + 4 * slot;
-      return block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
-    };
-    for (int64_t i = 0; i < slots; ++i) keys[i] = key(i, 13);
-    around_.resize(slots * kNeighbours);
-    parallel_for(slots, 64, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i)
-        for (int n = 0; n < kNeighbours; ++n) {
-          const uint64_t wanted = key(i, n);
-          const auto at = std::lower_bound(keys.begin(), keys.end(), wanted);
-          around_[i * kNeighbours + n] =
-              at != keys.end() && *at == wanted ? static_cast<int32_t>(at - keys.begin()) : -1;
-        }
-    });
+  // The slots around a slot, -1 where there is none; looked up when first asked for after a build.
+  const int32_t* around(int32_t slot) {
+    int32_t* found = around_.data() + kNeighbours * int64_t(slot);
+    if (found[0] != kUnknown) return found;
+    const int32_t* b = s_.slot_coord + 4 * int64_t(slot);
+    for (int n = 0; n < kNeighbours; ++n) {
+      const uint64_t wanted =
+          block_key(b[0] + n / 9 - 1, b[1] + n / 3 % 3 - 1, b[2] + n % 3 - 1, b[3]);
+      const auto at = std::lower_bound(keys_.begin(), keys_.end(), wanted);
+      found[n] = at != keys_.end() && *at == wanted ? static_cast<int32_t>(at - keys_.begin()) : -1;
+    }
+    return found;
   }
   template <typename F>
   void for_particles(int64_t h, const F& f) const {
@@ -89,7 +89,8 @@ class DamagePass {
   // Slots of points with damage or near their threshold, and those around them.
   bool find_active(const HomePass<T>& pass) {
     const SolverClock& c = *s_.clock;
-    number_.assign(c.slots, -1);
+    number_.assign(c.slots, kNoPart);
+    extent_.resize(c.slots);
     std::atomic<bool> any{false};
     parallel_for(c.homes, kHomeGrain, [&](int64_t begin, int64_t end) {
       for (int64_t h = begin; h < end; ++h) {
@@ -108,20 +109,14 @@ class DamagePass {
       }
     });
     if (!any) return false;
-    look_around();
     slots_.clear();
     std::vector<int32_t> seeds;
     for (int64_t i = 0; i < c.slots; ++i)
       if (number_[i] == 0) seeds.push_back(static_cast<int32_t>(i));
     for (const int32_t seed : seeds)
       for (int n = 0; n < kNeighbours; ++n) {
-        const int32_t slot = around_[kNeighbours * int64_t(seed) + n];
+        const int32_t slot = around(seed)[n];
         if (slot >= 0) number_[slot] = 0;
-      }
-    for (int64_t i = 0; i < c.slots; ++i)
-      if (number_[i] == 0) {
-        number_[i] = static_cast<int32_t>(slots_.size());
-        slots_.push_back(static_cast<int32_t>(i));
       }
     for (int color = 0; color < kColors; ++color) {
       homes_[color].clear();
@@ -131,10 +126,61 @@ class DamagePass {
           const int32_t slot = s_.neighbour[kNeighbours * int64_t(h) + n];
           meets = slot >= 0 && slot < c.slots && number_[slot] >= 0;
         }
-        if (meets) homes_[color].push_back(h);
+        if (!meets) continue;
+        homes_[color].push_back(h);
+        mark_matter(pass.box_[h], s_.neighbour + kNeighbours * int64_t(h));
       }
     }
+    // What is around powder is mostly empty: no rows for that.
+    for (int64_t i = 0; i < c.slots; ++i)
+      if (number_[i] == kMatter) {
+        number_[i] = static_cast<int32_t>(slots_.size());
+        slots_.push_back(static_cast<int32_t>(i));
+      } else if (number_[i] == 0) {
+        number_[i] = kEmpty;
+      }
     return true;
+  }
+
+  // Nodes [lo, hi) of a slot that particles touch, on each axis.
+  struct Extent {
+    int8_t lo[3], hi[3];
+  };
+  void mark_matter(const Box& box, const int32_t* neighbour) {
+    int lo[3][3], hi[3][3];  // [axis][block of the window]
+    for (int axis = 0; axis < 3; ++axis)
+      for (int block = 0; block < 3; ++block) {
+        const int first = 4 * block - 3;  // window_block(first) is the first to be `block`
+        lo[axis][block] = std::max<int>(box.lo[axis], first) - first;
+        hi[axis][block] = std::min<int>(box.hi[axis], first + 4) - first;
+      }
+    for (int n = 0; n < kNeighbours; ++n) {
+      const int block[3] = {n / 9, n / 3 % 3, n % 3};
+      bool touched = true;
+      for (int axis = 0; axis < 3; ++axis)
+        touched = touched && lo[axis][block[axis]] < hi[axis][block[axis]];
+      const int32_t slot = neighbour[n];
+      if (!touched || slot < 0 || slot >= s_.clock->slots || number_[slot] < 0) continue;
+      if (number_[slot] != kMatter) extent_[slot] = Extent{{4, 4, 4}, {0, 0, 0}};
+      number_[slot] = kMatter;
+      for (int axis = 0; axis < 3; ++axis) {
+        int8_t &l = extent_[slot].lo[axis], &h = extent_[slot].hi[axis];
+        l = std::min<int8_t>(l, static_cast<int8_t>(lo[axis][block[axis]]));
+        h = std::max<int8_t>(h, static_cast<int8_t>(hi[axis][block[axis]]));
+      }
+    }
+  }
+  // f(local index) for the nodes of an active slot that particles touch; of one colour, or of all
+  // if that is below 0.
+  template <typename F>
+  void for_each_node(int64_t row, int colour, const F& f) const {
+    const Extent& e = extent_[slots_[row]];
+    for (int i = e.lo[0]; i < e.hi[0]; ++i)
+      for (int j = e.lo[1]; j < e.hi[1]; ++j) {
+        const int along = local_index(i, j, 0), step = colour < 0 ? 1 : 2;
+        const int first = e.lo[2] + (colour >= 0 && node_colour(along + e.lo[2]) != colour);
+        for (int k = first; k < e.hi[2]; k += step) f(along + k);
+      }
   }
 
   using Sums = double __attribute__((vector_size(8 * kDamageSums)));
@@ -249,9 +295,8 @@ class DamagePass {
     parallel_for(count, 1, [&](int64_t begin, int64_t end) {
       for (int64_t b = begin; b < end; ++b) {
         int32_t face[6];  // slots beyond the faces
-        for (int f = 0; f < 6; ++f)
-          face[f] = around_[kNeighbours * int64_t(slots_[b]) + face_block(f)];
-        for (int local = 0; local < kBlockNodes; ++local) {
+        for (int f = 0; f < 6; ++f) face[f] = around(slots_[b])[face_block(f)];
+        for_each_node(b, -1, [&](int local) {
           const int64_t n = b * kBlockNodes + local;
           const Sums& node = nodes_[n];
           Edge& e = edge_[n];
@@ -263,7 +308,7 @@ class DamagePass {
             e.near[f] = 0;
             e.weight[f] = 0.0;
             if (slot < 0) return 0.0;
-            if (number_[slot] < 0) return node[kStiffSum];
+            if (number_[slot] < 0) return number_[slot] == kEmpty ? 0.0 : node[kStiffSum];
             const int64_t m = int64_t(number_[slot]) * kBlockNodes + there;
             if (!(nodes_[m][kVolumeSum] > empty_)) return 0.0;
             e.near[f] = static_cast<int32_t>(m);
@@ -272,7 +317,7 @@ class DamagePass {
           field_[n] = now.value;
           e.right = now.right;
           e.inverse = now.inverse;
-        }
+        });
       }
     });
   }
@@ -282,15 +327,14 @@ class DamagePass {
     for (int sweep = 0; sweep < 2 * kSweeps; ++sweep)
       parallel_for(count, 8, [&](int64_t begin, int64_t end) {
         for (int64_t b = begin; b < end; ++b)
-          for (int local = 0; local < kBlockNodes; ++local) {
-            if (node_colour(local) != sweep % 2) continue;
+          for_each_node(b, sweep % 2, [&](int local) {
             const Edge& e = edge_[b * kBlockNodes + local];
-            if (e.inverse == 0.0) continue;
+            if (e.inverse == 0.0) return;
             double sum = e.right;
             for (int f = 0; f < 6; ++f) sum += e.weight[f] * field_[e.near[f]];
             double& d = field_[b * kBlockNodes + local];
             d = relaxed(d, sum, e.inverse);
-          }
+          });
       });
   }
 
@@ -335,6 +379,10 @@ class DamagePass {
     }
   }
 
+  // In `number_`: takes no part; takes part, and is empty. While slots are found: 0 takes part,
+  // kMatter has matter. In `around_`: not looked up.
+  static constexpr int32_t kNoPart = -1, kEmpty = -2, kMatter = 1, kUnknown = -2;
+
   struct Edge {
     double weight[6], right, inverse;
     int32_t near[6];
@@ -344,9 +392,11 @@ class DamagePass {
   bool at2_ = false, alone_ = true;  // alone: there is no other law
   double empty_ = 0.0;
   T active_;                             // alpha from which a point takes part
-  std::vector<int32_t> around_;          // [slots, 27], or empty
+  std::vector<uint64_t> keys_;           // [slots]
+  std::vector<int32_t> around_;          // [slots, 27]
   std::vector<int32_t> homes_[kColors];  // homes that take part, by colour
-  std::vector<int32_t> number_;          // [slots] row of an active slot, or -1
+  std::vector<int32_t> number_;          // [slots] row of an active slot, or one of these
+  std::vector<Extent> extent_;           // [slots]
   std::vector<int32_t> slots_;           // active slots
   std::vector<Sums> nodes_;
   std::vector<Edge> edge_;

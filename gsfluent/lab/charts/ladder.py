@@ -36,6 +36,7 @@ KNOBS = {
     "gaussians": "Gaussians carried by material points, or each is one",
     "dt": "automatic time step, or a fixed one as in PhysGaussian's demos",
     "return_map": "implicit or explicit alpha, centre of the yield surface",
+    "law": "what breaks does so by NACC or by a phase field",
     "free": "measures that trade nothing",
     "adaptive": "flight in closed form, sleep",
     "textbook": "the textbook solver over the node spacings",
@@ -203,6 +204,7 @@ def _knobs(case: Case, dx: float, device: str, quick: bool) -> Iterator[Setting]
     if any(m["law"] == "nacc" for m in scene.materials):
         yield turned("return_map", "explicit alpha", implicit=False)
         yield turned("return_map", "fixed centre", k=math.inf)
+        yield turned("law", "phase field", law="phase_field")
 
 
 def _textbook(case: Case, steps: Sequence[float], device: str, quick: bool) -> list[Setting]:

@@ -7,6 +7,8 @@ row, in the column ``cohesion``; the field it belongs to is solved in
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -50,7 +52,14 @@ def drive_threshold(toughness: Tensor, length: Tensor, model: str) -> Tensor:
 def bounded(d: Tensor, n: Tensor, j2m1: Tensor, m: Material) -> tuple[Tensor, Tensor, Tensor]:
     """(d, J^2 - 1, whether anything is forgotten) of broken matter that opened or sheared far."""
     broken = m.cohesion >= BROKEN
-    far, sheared = broken & (j2m1 > VOLUME_MAX), broken & (n > SHEAR_MAX)
+    far = broken & (j2m1 > VOLUME_MAX)
+    # with a split by principal strains the others would be pressed as these are let go; squared
+    # since d, which is no logarithm, falls more slowly than one
+    principal = far & ((m.shear_damage.detach().long() & 3) == SPLITS["spectral"])
+    kept = (math.log1p(VOLUME_MAX) / torch.log1p(j2m1.clamp(min=VOLUME_MAX))) ** 2
+    kept = torch.where(principal, kept, 1.0)
+    d, n = kept[:, None] * d, kept * n
+    sheared = broken & (n > SHEAR_MAX)
     d = torch.where(sheared, SHEAR_MAX / n.clamp(min=SHEAR_MAX), 1.0)[:, None] * d
     return d, torch.where(far, VOLUME_MAX, j2m1), far | sheared
 

@@ -22,6 +22,9 @@ from gsfluent.ops.damage import damage_of
 
 STEEL = (190e9, 0.3, 8000.0)
 STEEL_TOUGHNESS = 22130.0
+PMMA = (5.76e9, 0.42, 1180.0)
+PMMA_TOUGHNESS = 309.0
+"""Of 1.47 MPa sqrt(m) in plane strain [J/m^2]."""
 RAMP = 1e-6
 """Time over which the bar gets its speed [s]."""
 STAGES = 10
@@ -123,12 +126,60 @@ def kalthoff(
     return found | _direction(scene, run, np.array([tip, height])), scene, run
 
 
-def _direction(scene: Scene, run: Run, tip: Floats) -> dict[str, Any]:
+def compact(dx: float, length: float, device: str) -> tuple[dict[str, Any], Scene, Run]:
+    """A compact compression specimen struck on one arm, after Rittel and Maigre 1996.
+
+    PMMA, 70 x 60 mm; a slot of 22 mm by 20 mm from the left edge, a notch of 12 mm on from its
+    middle; a bar drives the lower arm at 20 m/s. The sizes are remembered, not read.
+
+    Args:
+        dx: Node spacing [m].
+        length: Of the phase field [m].
+        device: Where.
+    """
+    wide, high, deep, gap, tip = 0.07, 0.06, 0.022, 0.02, 0.034
+    row = cracks.griffith(*PMMA, toughness=PMMA_TOUGHNESS, length=length, dx=dx, split="spectral")
+    points = cracks.plate(np.zeros(2), np.array([wide, high]), dx, 8)
+    x, y = points[:, 0], np.abs(points[:, 1])
+    points = points[~((x < deep) & (y < 0.5 * gap)) & ~((x < tip) & (y < 1.51 * dx))]
+    breakable = points[:, 0] > 0.1 * wide  # not where the bar meets it
+    scene = free(
+        "compact", points, [0.0] * 3, dx, 8, np.linspace(0.0, 160e-6, 41)[1:],
+        (elastic(*PMMA), row), material=breakable,
+        volume=np.full(points.shape[0], slab_volume(dx, 8)), colliders=walls(dx),
+    )  # fmt: skip
+    arm = 0.5 * (high - gap)
+    half = [0.01, 0.5 * arm, 4.0 * dx]
+    bar = collider_row(
+        "box", point=(0.25 * dx - half[0], -0.5 * (high - arm), 0.0), extent=half, mode="separate"
+    )
+    run = struck(scene, bar, 20.0, device)
+    found = {"length_mm": 1e3 * length} | _direction(scene, run, np.array([tip, 0.0]), -1.0)
+    return found, scene, run
+
+
+def apart(line: Floats, other: Floats) -> float:
+    """Largest distance of the points of a path from another path, where both run.
+
+    Args:
+        line: Places from the notch, [B, 2].
+        other: The same of the other, [C, 2].
+    """
+    reach = np.hypot(*other.T)
+    both = line[np.hypot(*line.T) <= reach.max()]
+    gaps = np.linalg.norm(both[:, None] - other[None], axis=2).min(axis=1)
+    return float(gaps.max(initial=0.0))
+
+
+def _direction(scene: Scene, run: Run, tip: Floats, side: float = 1.0) -> dict[str, Any]:
     """Direction from the tip to the end, along the path in the middle, and the length."""
     assert run.damage is not None
     broken = run.damage >= BROKEN
     arms = [scene.x[b, :2] - tip for b in broken]
-    up = [a[(a[:, 1] > 0.0) & (np.hypot(a[:, 0], a[:, 1]) > 0.002)] for a in arms]
+    arms = [a * [1.0, side] for a in arms]
+    up = [
+        a[(a[:, 1] > 0.0) & (a[:, 0] > -0.01) & (np.hypot(a[:, 0], a[:, 1]) > 0.002)] for a in arms
+    ]
     if not len(up[-1]):
         return {
             "angle": math.nan,

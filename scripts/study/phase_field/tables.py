@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from struck import apart
 
 from gsfluent.figure.markdown import enter
 from gsfluent.io.atomic import atomic_path
@@ -36,7 +37,23 @@ HEADINGS = {
     "bending": (
         "## Three-point bending\n\n"
         "Miehe et al. 2010: 8 x 2 mm, notch of 0.4 mm, E 20.8 GPa, $G_c$ 500 J/m², l 0.06 mm, "
-        "AT2."
+        "AT2. Reference: finite elements of our own (`elements.py`), bilinear, quasi-static."
+    ),
+    "compact": (
+        "## Compact compression\n\n"
+        "Rittel and Maigre 1996: PMMA, one arm struck at 20 m/s; the sizes are remembered. The "
+        "crack turns back towards the loaded side (directions above 90 degrees). Reference: the "
+        "path of the finest grid at the same l."
+    ),
+    "floor": (
+        "## Twenty thousand steps\n\n"
+        "A ball of 12 cells thrown at a quarter of its wave speed, without gravity, and one that "
+        "falls and rests. Energies over that at the start."
+    ),
+    "melon": (
+        "## A melon on three grids\n\n"
+        "`fruit.watermelon`, its cracks driven by tension alone (`split: spectral`), l 25 mm on "
+        "every grid, eight seeds each."
     ),
 }
 """What stands above the tables that the page has not yet."""
@@ -144,6 +161,67 @@ def kalthoff(found: Sequence[Found]) -> str:
     return _table(head, rows)
 
 
+def bending(found: Sequence[Found], own: Sequence[Found]) -> str:
+    """Largest force of the beam beside that of finite elements."""
+    best = min(own, key=lambda f: -int(f["points"]), default=None)
+    force, way = (None, None) if best is None else (best["force"], best["moved"])
+    return peak([*own, *found], force, way)
+
+
+def compact(found: Sequence[Found]) -> str:
+    """Where the crack of the compact specimen goes."""
+    finest = max(found, key=lambda f: (f["length_mm"], f["points"]))
+    line = np.array(finest["path"]) / 1e3
+    rows = (
+        (
+            f["setting"], f"{f['first']:.0f}", f"{f['angle']:.0f}", f"{f['length']:.0f}",
+            f"{f['when']:.0f}", f"{1e3 * apart(np.array(f['path']) / 1e3, line):.1f}",
+        )
+        for f in found
+    )  # fmt: skip
+    head = (
+        "dx, l", "first direction [degrees]", "direction of the end", "length [mm]",
+        "broken from [us]", "off the finest of the widest l [mm]",
+    )  # fmt: skip
+    return _table(head, rows)
+
+
+def floor(found: Sequence[Found]) -> str:
+    """Balls over many steps."""
+    rows = (
+        (
+            f["name"], str(f["points"]), f"{f['steps']:,}", f"{100.0 * f['broken']:.0f} %",
+            f"{f['momentum']:.1e}", f"{f['gained']:.1e}", f"{f['kept']:.3f}",
+            "yes" if f["same"] else "no",
+        )
+        for f in found
+    )  # fmt: skip
+    head = (
+        "ball", "points", "steps", "broken", "momentum that nothing gave", "energy gained",
+        "energy left", "same bits in another order",
+    )  # fmt: skip
+    return _table(head, rows)
+
+
+def melon(found: Sequence[Found]) -> str:
+    """Pieces of melons over the grid."""
+    rows = []
+    for height, cells in sorted({(f["height"], f["cells"]) for f in found}):
+        mine = [f for f in found if (f["height"], f["cells"]) == (height, cells)]
+        clean = [f for f in mine if f["verdict"] == "clean"]
+        pieces = [float(f["pieces"]) for f in clean]
+        spread = float(np.std(pieces)) if pieces else math.nan
+        rows.append(
+            (
+                f"{height:g} m", str(cells), f"{len(clean)} of {len(mine)}",
+                f"{np.mean(pieces):.1f}" if pieces else "", f"{spread:.1f}",
+                _mean([f["largest"] for f in clean]), _mean([f["broken"] for f in clean]),
+            )
+        )  # fmt: skip
+    head = ("height", "cells", "clean", "pieces over 3 %", "+-", "largest", "broken")
+    return _table(head, rows)
+
+
 def cost(found: Sequence[Found]) -> str:
     """What a step takes beside one of NACC."""
     rows = (
@@ -196,7 +274,8 @@ def enter_page(found: Mapping[str, Found], out: Path, page: Path) -> None:
     parts = {
         "strip": strip, "branching": branching, "pmma": pmma, "kalthoff": kalthoff,
         "notch": lambda rows: peak(rows, 0.701, 5.55),
-        "bending": lambda rows: peak(rows, None, None), "cost": cost,
+        "bending": lambda rows: bending(rows, of("elements")), "cost": cost,
+        "compact": compact, "floor": floor, "melon": melon,
     }  # fmt: skip
     for test, table in parts.items():
         if rows := of(test):
