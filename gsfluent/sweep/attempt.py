@@ -65,7 +65,13 @@ def attempt(root: str | Path, name: str, function: Function, item: Any) -> str:
 
 
 def is_passing(error: BaseException) -> bool:
-    """Whether an error is of the moment: another try may find more memory or a better network."""
+    """Whether an error is of the moment: another try may find more memory or a better network.
+
+    A fault of a GPU may be another's: under NVIDIA's MPS a process that is ended in the middle of
+    its work takes all on its GPU with it.
+    """
+    if type(error).__name__ == "AcceleratorError":  # torch's, see wants_memory
+        return True
     if isinstance(error, OSError) and error.errno in _PASSING:
         return True
     if error.__cause__ is not None and is_passing(error.__cause__):

@@ -39,6 +39,17 @@ def dies_once(item: Path, folder: Path) -> str:
     return (folder / "half.txt").read_text()
 
 
+class AcceleratorError(RuntimeError):
+    """Named as torch's."""
+
+
+def gpu_fails_once(item: Path, folder: Path) -> int:
+    if not item.exists():
+        item.touch()
+        raise AcceleratorError("CUDA error: an illegal memory access was encountered")
+    return 7
+
+
 def touches_and_waits(item: Path, folder: Path) -> None:
     item.touch()
     time.sleep(600)

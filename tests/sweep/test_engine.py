@@ -18,6 +18,7 @@ import sweep_tasks
 from sweep_tasks import (
     all_squares,
     dies_once,
+    gpu_fails_once,
     names,
     never_ends,
     odd_ones_fail,
@@ -126,6 +127,11 @@ def test_a_failing_task_harms_no_other_and_is_listed(tmp_path: Path) -> None:
 def test_a_killed_task_is_tried_again_and_goes_on(tmp_path: Path) -> None:
     (found,) = map(dies_once, [tmp_path / "killed"], tmp_path / "out", ids=["one"], jobs=1)
     assert (found.value, found.tries) == ("half", 2)  # from what the first try had left
+
+
+def test_a_fault_of_a_gpu_may_be_anothers_and_is_tried_again(tmp_path: Path) -> None:
+    (found,) = map(gpu_fails_once, [tmp_path / "seen"], tmp_path / "out", ids=["one"], jobs=1)
+    assert (found.value, found.tries) == (7, 2)
 
 
 def test_a_process_that_dies_while_the_pool_looks_is_not_forgotten(tmp_path: Path) -> None:
