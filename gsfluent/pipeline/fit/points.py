@@ -30,7 +30,6 @@ from gsfluent.pipeline.fit.parameters import (
     VECTORS,
     Parameter,
     Unknowns,
-    flat,
     parameter,
     read_learn,
 )
@@ -152,7 +151,7 @@ class FieldTask:
         scene: The start.
         target: What was seen.
         laws: Experts.
-        learn: What is learnt beside their numbers.
+        learn: What is learnt beside their numbers, by ``OBJECT.NUMBER``: velocities.
         dx: Of the coarser grid [m].
         grids: 1 or 2.
         offset: Learn the offset of the floor.
@@ -200,7 +199,7 @@ def run_field(task: FieldTask) -> dict[str, Any]:
 
 
 def _unknowns(task: FieldTask, grid: Mixed) -> Unknowns:
-    learn = {key: b for key, b in flat(task.learn).items() if key.partition(".")[2] in VECTORS}
+    learn = [key for key in task.learn if key.partition(".")[2] in VECTORS]
     made = list(read_learn(task.scene, learn).parameters) if learn else []
     # a number that several laws read is one until their regions are known: two moduli that share a
     # place could not be told apart
