@@ -192,7 +192,8 @@ def run_field(task: FieldTask) -> dict[str, Any]:
         for grid in grids:
             grid.temperature = temperature
         part = (0.5, 1.0) if number == 0 else (1.0,)
-        found = in_stages(problem, free, finer=grids[1] if task.grids == 2 else None, shares=part)
+        finer = grids[1] if task.grids == 2 else None
+        found = in_stages(problem, free, finer=finer, shares=part, weigh=False)
         free = found.free
     runs = [grid.runs for grid in grids]
     return {"values": unknowns.values(free), "rms": found.rms, "runs": runs}
