@@ -30,7 +30,6 @@ from gsfluent.pipeline.fit.parameters import (
     VECTORS,
     Parameter,
     Unknowns,
-    flat,
     parameter,
     read_learn,
 )
@@ -152,7 +151,7 @@ class FieldTask:
         scene: The start.
         target: What was seen.
         laws: Experts.
-        learn: What is learnt beside their numbers.
+        learn: What is learnt beside their numbers, by ``OBJECT.NUMBER``: velocities.
         dx: Of the coarser grid [m].
         grids: 1 or 2.
         offset: Learn the offset of the floor.
@@ -193,14 +192,15 @@ def run_field(task: FieldTask) -> dict[str, Any]:
         for grid in grids:
             grid.temperature = temperature
         part = (0.5, 1.0) if number == 0 else (1.0,)
-        found = in_stages(problem, free, finer=grids[1] if task.grids == 2 else None, shares=part)
+        finer = grids[1] if task.grids == 2 else None
+        found = in_stages(problem, free, finer=finer, shares=part, weigh=False)
         free = found.free
     runs = [grid.runs for grid in grids]
     return {"values": unknowns.values(free), "rms": found.rms, "runs": runs}
 
 
 def _unknowns(task: FieldTask, grid: Mixed) -> Unknowns:
-    learn = {key: b for key, b in flat(task.learn).items() if key.partition(".")[2] in VECTORS}
+    learn = [key for key in task.learn if key.partition(".")[2] in VECTORS]
     made = list(read_learn(task.scene, learn).parameters) if learn else []
     # a number that several laws read is one until their regions are known: two moduli that share a
     # place could not be told apart

@@ -424,6 +424,7 @@ def in_stages(
     finer: Forward | None = None,
     shares: tuple[float, ...] = SHARES,
     settle: bool = True,
+    weigh: bool = True,
     tell: Tell | None = None,
 ) -> Fitted:
     """Velocities on the frames before contact, then all numbers on more and more frames.
@@ -431,7 +432,6 @@ def in_stages(
     All frames at once get stuck where the first rebound is wrong. With a finer grid each stage is a
     defect correction: what that grid changes is seen at the last values, and the search goes on
     with it on the coarse grid. How far the change goes on, beyond the finer grid, is learnt.
-    Finally every frame counts by what it is missed by.
 
     Args:
         problem: What is searched; with a finer grid its numbers have :data:`FINER`.
@@ -439,6 +439,7 @@ def in_stages(
         finer: The same scene on a finer grid.
         shares: Of the frames, by stage.
         settle: Search the last stage to its end.
+        weigh: There let every frame count by what it is missed by.
         tell: Told of each linearisation.
     """
     frames, free = len(problem.forward.times), start
@@ -451,14 +452,14 @@ def in_stages(
     counts = sorted({max(2, round(share * frames)) for share in shares})
     for count in counts:
         last = settle and count == counts[-1]
-        for number in range(CORRECTIONS if last else 1):
+        for number in range(CORRECTIONS if last and (finer or weigh) else 1):
             if finer is not None:
                 problem.refine(finer, free, count)
-            if number and found is not None:
+            if weigh and number and found is not None:
                 problem.reweigh(found.per_frame, found.count)
             found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
             moved, free = float(np.abs(found.free - free).max()), found.free
-            if number and moved < 10.0 * CLOSE:
+            if (number or not weigh) and moved < 10.0 * CLOSE:
                 break
     assert found is not None
     return dataclasses.replace(found, runs=problem.forward.runs - runs)

@@ -279,6 +279,17 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
+def patiently(function: Callable[..., dict[str, Any]], *task: Any) -> dict[str, Any]:
+    """Call it; once more after a while where the driver was not ready (a server that starts)."""
+    try:
+        return function(*task)
+    except RuntimeError as error:
+        if "cuda" not in str(error).lower():
+            raise
+    clock.sleep(8.0)
+    return function(*task)
+
+
 def in_pool(
     function: Callable[..., dict[str, Any]],
     tasks: list[tuple[Any, ...]],
@@ -293,7 +304,7 @@ def in_pool(
     end, records = clock.monotonic() + 60.0 * minutes, []
     os.environ.update({f"{kind}_NUM_THREADS": "1" for kind in ("OMP", "MKL", "OPENBLAS")})
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        calls = {pool.submit(function, *task): task for task in tasks}
+        calls = {pool.submit(patiently, function, *task): task for task in tasks}
         try:
             for call in as_completed(calls, timeout=max(end - clock.monotonic(), 0.0)):
                 if (error := call.exception()) is not None:

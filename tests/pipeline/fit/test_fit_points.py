@@ -14,7 +14,15 @@ from gsfluent.errors import InputError
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
-from gsfluent.pipeline.fit.points import FieldTask, Mixed, corners, divided, run_field, shares
+from gsfluent.pipeline.fit.points import (
+    FieldTask,
+    Mixed,
+    _unknowns,
+    corners,
+    divided,
+    run_field,
+    shares,
+)
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 
@@ -102,6 +110,15 @@ def test_regions_of_laws_get_numbers_of_their_own() -> None:
     assert {"thing/elastic.young_modulus", "thing.yield_stress"} <= set(found.values)
     assert found.values["thing.yield_stress"] == pytest.approx(1e3, rel=0.1)
     Forward(found.scene, TIMES, DX)
+
+
+def test_a_velocity_is_learnt_beside() -> None:
+    """As the stage hands it over, by keys."""
+    target = Points(torch.zeros(6, 1, 3).numpy())
+    laws = ("elastic", "von_mises")
+    task = FieldTask(scene(elastic()), target, laws, {"thing.velocity": True}, DX, 1, False, 2)
+    made = _unknowns(task, Mixed(scene(elastic()), TIMES, DX, laws, 2))
+    assert next(iter(made.slices())) == "thing.velocity" and len(made) == 3 + 3 + 8
 
 
 def test_what_cannot_be_mixed_is_said() -> None:
