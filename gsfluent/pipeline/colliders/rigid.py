@@ -7,6 +7,7 @@ float64, rolled back with the matter, and never written in place.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from typing import Any
@@ -121,7 +122,7 @@ class RigidSet:
         """Whether any of them is a free body."""
         return bool(self._free)
 
-    @property
+    @functools.cached_property
     def moves(self) -> bool:
         """Whether any of them ever moves, comes or goes."""
         if self.frees or not all(c is None or _steady(c) for c in self._colliders):
@@ -204,7 +205,7 @@ class RigidSet:
 
     def speed(self, rows: Tensor) -> Tensor:
         """Largest speed of any collider's matter [m/s], a tensor [] on the device."""
-        return self.speeds(rows).max() if self.count else rows.new_zeros(())
+        return self.speeds(rows).max() if self.moves else rows.new_zeros(())
 
     def moving(self, rows: Tensor) -> Tensor:
         """Colliders that move, that gravity is about to move, that will go, grips: rows, [K, 32].
@@ -212,6 +213,8 @@ class RigidSet:
         What leans on something that will go must not sleep: nobody would wake it. What a grip holds
         must not, as nobody would book the reaction.
         """
+        if not self.moves and not self.grips:
+            return rows[:0]
         active = self.speeds(rows) > 0.0
         active[self.grips] |= rows[self.grips, columns.TYPE] != _NOTHING
         for i, c in enumerate(self._colliders):
@@ -236,6 +239,8 @@ class RigidSet:
             impulse: Given to the matter between them [N s], float64 [M, 3].
             torque: About each collider's point [N m s], float64 [M, 3].
         """
+        if not self.moves:  # who stands gives nothing
+            return rows.new_zeros(())
         device = rows.device  # a few numbers: on a GPU each operation would cost a launch
         rows, now, impulse, torque = (v.cpu() for v in (rows, now, impulse, torque))
         given = (impulse * rows[:, 10:13]).sum(dim=1) + (torque * rows[:, 20:23]).sum(dim=1)

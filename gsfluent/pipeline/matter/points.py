@@ -21,7 +21,7 @@ from gsfluent.data import Frame, Particles, Solid
 from gsfluent.data.regions import SOURCES, region_mask
 from gsfluent.errors import InputError
 from gsfluent.materials import Material
-from gsfluent.ops.plasticity import weakened
+from gsfluent.ops.plasticity import compiled_apart, weakened
 from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
 from gsfluent.scene.parts import quaternion_to, turned
 from gsfluent.scene.scene import Body, Part, Scene
@@ -81,6 +81,11 @@ class Matter:
     def has_field(self) -> bool:
         """Whether any row is of phase-field matter."""
         return bool((self.law == materials.LAWS["phase_field"]).any())
+
+    @functools.cached_property
+    def compiled_apart(self) -> bool:
+        """Whether any row is of a law that the resident solver has no springs for."""
+        return bool(compiled_apart(self.law, self.params).any())
 
     @property
     def viscous(self) -> bool:

@@ -21,7 +21,6 @@ from gsfluent import ops
 from gsfluent.materials import LAWS
 from gsfluent.ops import SolverError
 from gsfluent.ops import collider as columns
-from gsfluent.ops.plasticity import compiled_apart
 from gsfluent.ops.reference import touch
 from gsfluent.ops.solver_buffers import MAX_FIELDS
 from gsfluent.pipeline.colliders.blades import BladeSet
@@ -71,12 +70,11 @@ def resident_can(rows: Tensor, rigid: RigidSet, matter: Matter) -> bool:
         rigid: The colliders.
         matter: The points, for the heaviest density and the grid spacing.
     """
-    known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
-    if matter.has_field and not bool(torch.isin(matter.law, known).all()):
-        return False  # not there yet
-    if matter.viscous and (
-        matter.has_field or bool(compiled_apart(matter.law, matter.params).any())
-    ):
+    if matter.has_field:
+        known = matter.law.new_tensor([LAWS[name] for name in ("elastic", "nacc", "phase_field")])
+        if not bool(torch.isin(matter.law, known).all()):
+            return False  # not there yet
+    if matter.viscous and (matter.has_field or matter.compiled_apart):
         return False  # not there yet
     if not rigid.frees:
         return True
