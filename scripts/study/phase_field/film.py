@@ -29,8 +29,6 @@ from gsfluent.scene.scene import Scene
 PICTURE = Path(__file__).resolve().parents[3] / "docs" / "images" / "phase_field_laws.jpg"
 LAWS = ("nacc", "phase_field")
 FPS, SECONDS = 400, 0.04
-WALL = 12.0
-"""Thickness of both [cells]: what is thinner than the cracks are wide is punched through."""
 MOMENTS = (0.15, 0.35, 0.6, 1.0)
 
 
@@ -67,10 +65,10 @@ def turned(angle: float, axis: int) -> Frame:
     return Frame(turn, torch.zeros(3), 1.0)
 
 
-def pane(cells: int, law: str, speed: float) -> tuple[Scene, float]:
+def pane(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float]:
     """A pane of 0.3 m that is thrown down on a corner, and the size of a cell."""
     dx = 0.3 / cells
-    half = (0.15, 0.1, 0.5 * WALL * dx)
+    half = (0.15, 0.1, 0.5 * walls * dx)
     body = solid(half, lambda x: (x.abs() <= torch.tensor(half)).all(dim=-1), 0.5 * dx)
     glass = materials.glass.override(law=law)
     scene = Scene()
@@ -80,10 +78,10 @@ def pane(cells: int, law: str, speed: float) -> tuple[Scene, float]:
     return scene, dx
 
 
-def bowl(cells: int, law: str, speed: float) -> tuple[Scene, float]:
+def bowl(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float]:
     """A bowl of 0.16 m that is thrown down on its bottom, and the size of a cell."""
     dx = 0.16 / cells
-    wall = WALL * dx
+    wall = walls * dx
 
     def inside(x: torch.Tensor) -> torch.Tensor:
         radius = x.norm(dim=-1)
@@ -98,10 +96,10 @@ def bowl(cells: int, law: str, speed: float) -> tuple[Scene, float]:
 
 
 def run(
-    make: Any, cells: int, law: str, speed: float, device: str
+    make: Any, cells: int, law: str, speed: float, walls: float, device: str
 ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, Any]]:
     """Positions and pieces of every frame, and figures of the last."""
-    scene, dx = make(cells, law, speed)
+    scene, dx = make(cells, law, speed, walls)
     simulation = Simulate(dx=dx, device=device)(scene, fps=FPS, seconds=SECONDS)
     places, pieces = [], []
     for frame in simulation:
@@ -145,6 +143,10 @@ def main() -> int:
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--cells", type=int, default=64, help="along the longest side")
     parser.add_argument("--speed", type=float, default=2.5, help="of the throw [m/s]")
+    parser.add_argument(
+        "--walls", type=float, default=12.0,
+        help="thickness [cells]; what is thinner than cracks are wide is punched through",
+    )  # fmt: skip
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--only", default="pane,bowl", metavar="BODY,...")
     parser.add_argument("--enter", action="store_true", help="the picture becomes that of the docs")
@@ -159,7 +161,7 @@ def main() -> int:
     shown: dict[tuple[str, str], Any] = {}
     for body in args.only.split(","):
         for law in LAWS:
-            shown[body, law] = run(made[body], args.cells, law, args.speed, args.device)
+            shown[body, law] = run(made[body], args.cells, law, args.speed, args.walls, args.device)
             sys.stderr.write(f"{body} {law}: {json.dumps(shown[body, law][2])}\n")
     told = {f"{body} {law}": value[2] for (body, law), value in shown.items()}
     (args.out / "laws.json").write_text(json.dumps(told, indent=1), encoding="utf-8")

@@ -11,7 +11,6 @@ import torch
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Floats, Scene
 from gsfluent.fracturebench.scenes import cracks
-from gsfluent.fracturebench.scenes.rows import BROKEN
 from gsfluent.fracturebench.scenes.slabs import slab_volume, walls
 from gsfluent.fracturebench.shapes import elastic, free, plane
 from gsfluent.lab.frozen.answer import rows
@@ -19,6 +18,7 @@ from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.resident import Resident
 from gsfluent.ops.collider import POINT, VELOCITY, collider_row
 from gsfluent.ops.damage import damage_of
+from gsfluent.ops.reference.phase_field import BROKEN
 
 STEEL = (190e9, 0.3, 8000.0)
 STEEL_TOUGHNESS = 22130.0
