@@ -32,12 +32,13 @@ kind=cpu
 [ "$GSFLUENT_CUDA" = 1 ] && kind=cuda-$GSFLUENT_ARCH
 work=build/wheel/$kind
 rm -rf "$work/lib" "$work/dist"
+# --skip-build: bdist_wheel would build once more, and torch adds its flags to an extension each time, so all of it
 # the same archive from the same commit
 SOURCE_DATE_EPOCH=$(git log -1 --format=%ct 2> /dev/null || echo 315532800)
 export SOURCE_DATE_EPOCH
 mkdir -p "$work"
 "$PYTHON" setup.py -q build --build-base "$work" --build-lib "$work/lib" --build-temp "$work/temp" \
-  bdist_wheel --bdist-dir "$work/bdist" --dist-dir "$work/dist" > "$work/build.log" 2>&1 || {
+  bdist_wheel --skip-build --bdist-dir "$work/bdist" --dist-dir "$work/dist" > "$work/build.log" 2>&1 || {
   tail -n 40 "$work/build.log"
   echo "wheel.sh: it does not build; all of it is in $work/build.log" >&2
   exit 1
