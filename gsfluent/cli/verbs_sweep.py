@@ -131,7 +131,7 @@ class Fit(Verb):
       gsfluent fit shot.yaml --masks films/ --cameras capture/ --learn melon.young_modulus -o out
       gsfluent fit shot.yaml --points track.npz --laws elastic,von_mises,fluid -o out
       gsfluent fit shot.yaml --pieces pieces.csv --learn cup.tensile_strength --cells 32 -o out
-      gsfluent fit shot.yaml --guidance sds --model zeroscope/ --prompt "jelly falls" --learn ...
+      gsfluent fit shot.yaml --guidance sds --model video/ --prompt jelly --learn a.viscosity -o out
 
     The shot says where the search starts, and what is believed: geometry, density, gravity, floor.
     What the motion does not show is called unidentified and given as a bound. A fit that was
