@@ -9,19 +9,15 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 
 from gsfluent.choose.shot import shot_scene
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.fit.job import FILES, fitted
-from gsfluent.io import atomic_path, write_json
+from gsfluent.fit.job import UNSEEN, each_once, left
 from gsfluent.io.checked.files import read_text
 from gsfluent.pipeline.fit import Break, FitPieces, run_break
 from gsfluent.progress import LineReporter, Reporter
 from gsfluent.results.store import content_digest, fingerprint
-from gsfluent.sweep.engine import map as sweep_map
-from gsfluent.sweep.engine import required
 from gsfluent.targets.pieces import Pieces
 
 
@@ -76,12 +72,7 @@ def pieces_to(
         learn, seeds=seeds, rounds=rounds, cells=cells, device=device, seed=seed, runner=runner
     )
     found = stage(scene, target, progress=reporter.task("fit"))
-    outputs = {key: FILES[key] for key in ("fit", "shot")}
-    values = {"target": "pieces", **found.report, "outputs": outputs}
-    write_json(out / FILES["fit"], values)
-    with atomic_path(out / FILES["shot"]) as part:
-        part.write_text(yaml.safe_dump(fitted(shot, found), sort_keys=False), encoding="utf-8")
-    return values
+    return left(shot, out, found, UNSEEN, target="pieces")
 
 
 def break_task(task: Break, folder: Path) -> dict[str, list[float]]:
@@ -101,12 +92,7 @@ def _through_sweep(
     tasks = list(items)
     matter = [repr([(b.material, b.parts) for b in t.scene.bodies]) for t in tasks]
     ids = [fingerprint(base, m, t.dx, t.time, t.seed) for m, t in zip(matter, tasks, strict=True)]
-    unlike = dict(zip(ids, tasks, strict=True))
-    outcomes = sweep_map(
-        break_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True
-    )
-    done = {o.id: o.value for o in required(outcomes, "simulations failed", folder)}
-    return [done[name] for name in ids]
+    return each_once(break_task, tasks, ids, folder, jobs, on, "simulations failed")
 
 
 def read_pieces(path: Path) -> tuple[list[float], list[list[float]] | None]:

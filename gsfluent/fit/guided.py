@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 
 from gsfluent.choose.shot import shot_scene
 from gsfluent.config import Shot
 from gsfluent.errors import InputError
-from gsfluent.fit.job import FILES, fitted
-from gsfluent.io import atomic_path, write_json
+from gsfluent.fit.job import UNSEEN, left
 from gsfluent.pipeline.fit import Guide, VideoPrior
 from gsfluent.progress import LineReporter, Reporter
 
@@ -64,9 +62,4 @@ def guide_to(
         seed=seed,
     )  # fmt: skip
     found = stage(scene, progress=reporter.task("guided"))
-    outputs = {key: FILES[key] for key in ("fit", "shot")}
-    values = {"target": "sds", "prompt": prompt, **found.report, "outputs": outputs}
-    write_json(out / FILES["fit"], values)
-    with atomic_path(out / FILES["shot"]) as part:
-        part.write_text(yaml.safe_dump(fitted(shot, found), sort_keys=False), encoding="utf-8")
-    return values
+    return left(shot, out, found, UNSEEN, target="sds", prompt=prompt)

@@ -34,6 +34,8 @@ from gsfluent.sweep.engine import required
 from gsfluent.targets.target import Target
 
 FILES = {"fit": "fit.json", "shot": "fitted.yaml", "report": "fit.html"}
+UNSEEN = {key: FILES[key] for key in ("fit", "shot")}
+"""Of a fit to no motion, which has no curves to show."""
 
 
 def fit_to(
@@ -118,10 +120,7 @@ def fit_to(
         device=device,
     )  # fmt: skip
     found = stage(scene, target, progress=reporter.task("fit"))
-    values = {"target": kind, **found.report, "outputs": dict(FILES)}
-    write_json(out / FILES["fit"], values)
-    with atomic_path(out / FILES["shot"]) as part:
-        part.write_text(yaml.safe_dump(fitted(shot, found), sort_keys=False), encoding="utf-8")
+    values = left(shot, out, found, FILES, target=kind)
     page(out, values, target.times).write(out / FILES["report"])
     return values
 
@@ -145,12 +144,36 @@ def _through_sweep(
         fingerprint(base, t.start, t.dx, list(t.shares), t.grids, t.judge, t.name, t.device)
         for t in tasks
     ]
+    return each_once(search_task, tasks, ids, folder, jobs, on, "searches failed")
+
+
+def each_once(
+    function: Callable[[Any, Path], Any],
+    tasks: Sequence[Any],
+    ids: Sequence[str],
+    folder: Path,
+    jobs: int | None,
+    on: str,
+    failed: str,
+) -> list[Any]:
+    """What a sweep finds for tasks, in their order; those with the same id are done once."""
     unlike = dict(zip(ids, tasks, strict=True))
     outcomes = sweep_map(
-        search_task, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True
+        function, unlike.values(), folder, ids=list(unlike), jobs=jobs, on=on, retry=True
     )
-    done = {o.id: o.value for o in required(outcomes, "searches failed", folder)}
+    done = {o.id: o.value for o in required(outcomes, failed, folder)}
     return [done[name] for name in ids]
+
+
+def left(
+    shot: Shot, out: Path, found: Found, outputs: Mapping[str, str], **said: Any
+) -> dict[str, Any]:
+    """Leave ``fit.json`` and ``fitted.yaml``, and return the content of the first."""
+    values = {**said, **found.report, "outputs": dict(outputs)}
+    write_json(out / FILES["fit"], values)
+    with atomic_path(out / FILES["shot"]) as part:
+        part.write_text(yaml.safe_dump(fitted(shot, found), sort_keys=False), encoding="utf-8")
+    return values
 
 
 def fitted(shot: Shot, found: Found) -> dict[str, Any]:

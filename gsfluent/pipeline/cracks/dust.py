@@ -23,12 +23,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsfluent import geometry, materials
+from gsfluent import geometry, materials, ops
 from gsfluent.data import SPRAY, Gaussians
 from gsfluent.pipeline.cracks.gaps import Births
 from gsfluent.pipeline.matter.pieces import dust_limit
 from gsfluent.pipeline.matter.points import Matter
-from gsfluent.pipeline.partition.chips import hashed, hashes
+from gsfluent.pipeline.partition.chips import hashed
 from gsfluent.results.frames import DUST
 from gsfluent.scene.scene import Scene
 
@@ -409,7 +409,7 @@ def _thrown(seed: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
     ring = (1.0 - height * height).sqrt()
     toward = torch.stack([ring * angle.cos(), ring * angle.sin(), height], dim=1)
     out = (0.5 + 0.5 * hashed(seed, 3))[:, None] * toward
-    return out, 0.5 * hashes(seed, range(4, 7)) * edge[:, None]
+    return out, 0.5 * ops.hashes(seed, range(4, 7)) * edge[:, None]
 
 
 def _chips(row: Tensor, seed: Tensor, size: Tensor, edge: Tensor, most: float) -> list[Tensor]:
@@ -420,17 +420,18 @@ def _chips(row: Tensor, seed: Tensor, size: Tensor, edge: Tensor, most: float) -
     in the plane that is met first that way. All of it is stretched to three unlike edges.
     """
     toward, offset = _thrown(seed, edge)
-    draw = 0.5 + 0.5 * hashes(seed, range(7, 9))
+    draw = 0.5 + 0.5 * ops.hashes(seed, range(7, 9))
     low, high = draw.new_tensor(FLAT).unbind(dim=1)
     half = torch.cat([torch.ones_like(draw[:, :1]), low + draw * (high - low)], dim=1)
     half = half * geometry.product(half)[:, None].pow(-1.0 / 3.0)
-    frame = torch.nn.functional.normalize(hashes(seed, range(9, 13)) + 1e-6, dim=1)
+    frame = torch.nn.functional.normalize(ops.hashes(seed, range(9, 13)) + 1e-6, dim=1)
     lag = (0.5 + 0.5 * hashed(seed, 14)) * (1.0 - (size / (2.0 * edge)).clamp(max=1.0))
-    spin = TUMBLE * hashes(seed, range(15, 18)) / size[:, None]
+    spin = TUMBLE * ops.hashes(seed, range(15, 18)) / size[:, None]
     planes = torch.tensor(_PLANES, dtype=torch.float64, device=row.device)
-    normal = planes + TILT * hashes(seed, range(20, 20 + planes.numel())).view(-1, *planes.shape)
+    tilt = ops.hashes(seed, range(20, 20 + planes.numel())).view(-1, *planes.shape)
+    normal = planes + TILT * tilt
     normal = torch.nn.functional.normalize(normal, dim=2)
-    reach = 1.0 + UNEVEN * hashes(seed, range(64, 64 + len(planes)))
+    reach = 1.0 + UNEVEN * ops.hashes(seed, range(64, 64 + len(planes)))
     count = splats_of(size / (most * edge))
     chip = torch.arange(len(row), device=row.device).repeat_interleave(count)
     which = torch.arange(len(chip), device=row.device)
@@ -445,7 +446,7 @@ def _chips(row: Tensor, seed: Tensor, size: Tensor, edge: Tensor, most: float) -
         met = torch.minimum(met, far)
     own = (seed[chip] ^ ((which * 0xC2B2AE35) & 0xFFFFFFFF)) & 0xFFFFFFFF
     met = met * (1.0 + ROUGH * hashed(own, 80))
-    flat = torch.nn.functional.normalize(flat + RUGGED * hashes(own, range(81, 84)), dim=1)
+    flat = torch.nn.functional.normalize(flat + RUGGED * ops.hashes(own, range(81, 84)), dim=1)
     # between splats that look all ways evenly there is the same volume
     cubes = (met.pow(3) * _FINE).round().long()  # whole numbers, whose sum has no order
     cubes = torch.zeros_like(row).index_add_(0, chip, cubes).double() / (_FINE * count)

@@ -4,7 +4,7 @@ from gsfluent._lazy import room
 
 __getattr__, __dir__, __all__ = room(
     __name__,
-    chips="hashed hashes",
+    chips="hashed",
     mesh="PieceMesh Surfaces",
     roughness="amplitude relief",
     splits="Split Splits",

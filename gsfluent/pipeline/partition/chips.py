@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -139,7 +138,7 @@ def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     spread = square.double() / many[..., None] - middle[:, :, None] * middle[:, None]
     seed = (total[:, 0] * 0x8DA6B343) ^ (total[:, 1] * 0xD8163841) ^ (total[:, 2] * 0xCB1AB31F)
     seed = (seed ^ (count * 0x9E3779B1)) & _MASK
-    turn = _turns(hashes(seed, range(4)))
+    turn = _turns(ops.hashes(seed, range(4)))
     base = torch.tensor(_PLANES, dtype=torch.float64, device=device)
     parts = []
     for axis in range(3):  # turned, one product at a time
@@ -147,7 +146,7 @@ def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         parts.append(row[:, 0] + row[:, 1] + row[:, 2])
     normal = torch.stack(parts, dim=2)
     planes = len(_PLANES)
-    tilt = hashes(seed, range(8, 8 + 3 * planes)).view(-1, planes, 3)
+    tilt = ops.hashes(seed, range(8, 8 + 3 * planes)).view(-1, planes, 3)
     normal = normal + TILT * tilt
     x, y, z = normal.unbind(dim=2)
     normal = normal / (x * x + y * y + z * z).sqrt()[..., None]
@@ -155,12 +154,12 @@ def _planes(nearest: Tensor, chips: list[int]) -> tuple[Tensor, Tensor, Tensor]:
     x, y, z = normal.unbind(dim=2)
     length = (x * x + y * y + z * z).sqrt()
     normal, reach = normal / length[..., None], 1.0 / length
-    shift = hashes(seed, range(64, 64 + planes))
+    shift = ops.hashes(seed, range(64, 64 + planes))
     # half of the corners are not cut
     corner = torch.arange(planes, device=device) >= _SIDES
-    far = corner & (hashes(seed, range(96, 96 + planes)) < 0.0)
+    far = corner & (ops.hashes(seed, range(96, 96 + planes)) < 0.0)
     # opposite sides go out together: some boxes are slabs, some are rods
-    wide = 1.0 + FLAT * hashes(seed, [112 + min(p, _SIDES) // 2 for p in range(planes)])
+    wide = 1.0 + FLAT * ops.hashes(seed, [112 + min(p, _SIDES) // 2 for p in range(planes)])
     return middle, normal, reach * torch.where(far, _AWAY, wide * (1.0 + UNEVEN * shift))
 
 
@@ -184,13 +183,8 @@ def _stretched(normal: Tensor, spread: Tensor) -> Tensor:
 
 
 def hashed(seed: Tensor, turn: int) -> Tensor:
-    """One of :func:`hashes`, of the shape of ``seed``."""
-    return hashes(seed, [turn])[..., 0]
-
-
-def hashes(seed: Tensor, turns: Sequence[int]) -> Tensor:
-    """Uniform values in -1 to 1, float64, from whole numbers below 2^32, [..., turns]."""
-    return ops.hashes(seed, turns)
+    """One of :func:`gsfluent.ops.hashes`, of the shape of ``seed``."""
+    return ops.hashes(seed, [turn])[..., 0]
 
 
 def _turns(four: Tensor) -> Tensor:

@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from tracks import DATA, FPS, PAGE, SIDE
+from tracks import DATA, FPS, PAGE, SIDE, entered
 
 from gsfluent.data import SURFACE, Gaussians, Solid
-from gsfluent.figure.markdown import enter
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit, Simulate
 from gsfluent.pipeline.fit.forward import Forward
@@ -162,9 +161,7 @@ def main() -> None:
         found[key] = {"time": time, "block": blocks}[name](options.device)
         path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
         print(json.dumps(found[key]), flush=True)
-    page: Path = options.markdown
-    known = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"
-    page.write_text(enter(known, "bars", text(found), "## Time, and two laws"), encoding="utf-8")
+    entered(options.markdown, "bars", text(found), "## Time, and two laws")
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from tracks import (
     SIDE,
     SURE,
     ellipsoid,
+    entered,
     errors_of,
     fall,
     in_pool,
@@ -36,7 +37,6 @@ from tracks import (
 )
 
 from gsfluent.data import SURFACE, Camera, Gaussians, Solid
-from gsfluent.figure.markdown import enter
 from gsfluent.pipeline import Fit
 from gsfluent.targets import Masks
 from gsfluent.targets.target import Followers, Motion, Setting
@@ -246,10 +246,7 @@ def main() -> None:
              if (k, n, v) not in done and (folder / f"{k}_{n}.npz").is_file()]  # fmt: skip
     records += in_pool(record, tasks, options.out, options.jobs, options.minutes)
     if records:
-        page: Path = options.markdown
-        text = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"
-        text = enter(text, "films", table(records), "## Films that VTK has drawn")
-        page.write_text(text, encoding="utf-8")
+        entered(options.markdown, "films", table(records), "## Films that VTK has drawn")
 
 
 if __name__ == "__main__":

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from tracks import DATA, FPS, KINDS, PAGE, SIDE, in_pool, read, scene_of, seen
+from tracks import DATA, FPS, KINDS, PAGE, SIDE, entered, in_pool, read, scene_of, seen
 
-from gsfluent.figure.markdown import enter
 from gsfluent.pipeline.fit.laws import choose_laws
 from gsfluent.pipeline.fit.task import one_by_one
 from gsfluent.targets import Points
@@ -80,10 +79,7 @@ def main() -> None:
     tasks = [(n, options.cells, options.device) for n in range(options.scenes) if n not in done]
     records += in_pool(record, tasks, options.out, options.jobs, options.minutes)
     if records:
-        page: Path = options.markdown
-        text = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"
-        text = enter(text, "laws", table(records), "## Which law")
-        page.write_text(text, encoding="utf-8")
+        entered(options.markdown, "laws", table(records), "## Which law")
 
 
 if __name__ == "__main__":

@@ -320,6 +320,12 @@ def in_pool(
     return records
 
 
+def entered(page: Path, name: str, part: str, heading: str = "") -> None:
+    """Enter a table into the page of fits, which is begun where there is none."""
+    text = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"
+    page.write_text(enter(text, name, part, heading), encoding="utf-8")
+
+
 def main() -> None:
     """Do what is left, then enter the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -345,9 +351,7 @@ def main() -> None:
     tasks = [(k, n, options.cells, options.keep, options.device) for k, n in wanted]
     records += in_pool(record, tasks, path, options.jobs, options.minutes)
     if records:
-        page: Path = options.markdown
-        text = page.read_text(encoding="utf-8") if page.is_file() else "# Materials from tracks\n"
-        page.write_text(enter(text, "fit", table(records)), encoding="utf-8")
+        entered(options.markdown, "fit", table(records))
 
 
 if __name__ == "__main__":
