@@ -82,6 +82,21 @@ def test_what_does_not_fit_is_said(photographs: Path, tmp_path: Path) -> None:
     assert list((tmp_path / "none").iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("end", "why"), [("os.abort()", "ended with -"), ("raise ValueError('bad photograph')", "bad")]
+)
+def test_what_colmap_dies_of_ends_there(
+    end: str, why: str, photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pycolmap")
+    (tmp_path / "pycolmap.py").write_text(f"import os\n{end}\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(RunError, match=why) as caught:
+        find_poses(photographs, tmp_path / "out")
+    assert "newspaper" in caught.value.hint
+    assert list((tmp_path / "out").iterdir()) == []
+
+
 def test_wrong_inputs(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     with pytest.raises(InputError, match="0 photographs"):
