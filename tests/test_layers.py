@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import graphlib
 import re
 import subprocess
@@ -45,6 +46,11 @@ ALONE = "fracturebench"
 MANY_FILES = ("ops", "ops/reference")
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def module_of(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -53,11 +59,12 @@ def module_of(path: Path) -> str:
 MODULES = {module_of(path): path for path in SOURCES}
 
 
+@functools.cache
 def imported(path: Path) -> set[str]:
     """Modules of the package that a module imports anywhere: on top, in functions, for types."""
     found = set()
     package = list(path.relative_to(ROOT).parts[:-1])
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -129,7 +136,7 @@ LIBRARIES = (
 
 def face(folder: Path) -> dict[str, set[str]]:
     """What the table in a room's ``__init__.py`` says that others may take, by module."""
-    tree = ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))
+    tree = tree_of(folder / "__init__.py")
     (call,) = (n for n in ast.walk(tree) if getattr(getattr(n, "func", None), "id", "") == "room")
     package = module_of(folder / "__init__.py")
     whole = {str(ast.literal_eval(word)) for word in call.args[1:]}
@@ -140,7 +147,7 @@ def face(folder: Path) -> dict[str, set[str]]:
 def test_a_room_names_what_others_take() -> None:
     taken: dict[Path, dict[str, set[str]]] = {}
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if not isinstance(node, ast.ImportFrom) or node.level or node.module not in MODULES:
                 continue
             home = MODULES[node.module]
@@ -216,7 +223,7 @@ def test_no_machine_paths() -> None:
 def test_library_does_not_print() -> None:
     found = []
     for path in SOURCES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print":
                 found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     assert found == []
@@ -235,7 +242,7 @@ def test_heavy_libraries_are_imported_late() -> None:
     )
     found = []
     for path in SOURCES:
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.Import):
                 names = [a.name for a in node.names]
             elif isinstance(node, ast.ImportFrom):
