@@ -418,7 +418,10 @@ cudaError_t raster_backward(const RasterGradArgs<T>& b, const SplatSums<T>& sums
   const cudaError_t error =
       with_variant<T>(sums.active, a.groups != nullptr, [&]<int kF, bool kGroups>() {
         const auto run = [&]<bool kAbsolute, bool kOrderFree>() {
-          blend_backward_kernel<T, kF, kGroups, kAbsolute, kOrderFree>
+          // Absolute sums are asked for in training, of rgb and depth; what else may want them
+          // shares a kernel: twelve fewer to build and to ship.
+          constexpr int kRoom = kAbsolute && (kF > 4 || kGroups) ? kMaxFeatures : kF;
+          blend_backward_kernel<T, kRoom, kGroups, kAbsolute, kOrderFree>
               <<<blend_blocks(a), kBlockThreads, 0, stream>>>(b, sums);
         };
         if (sums.fixed) {
