@@ -14,6 +14,7 @@ each of so many GPUs, against the first number of them. Enters docs/measured/swe
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import shutil
@@ -149,8 +150,13 @@ def spread(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def spread_table(rows: list[dict[str, Any]]) -> str:
-    """The table of several GPUs."""
-    rows = sorted(rows, key=lambda row: int(row["gpus"]))
+    """A table of several GPUs for each machine."""
+    rows = sorted(rows, key=lambda row: (int(row["cores"]), int(row["gpus"])))
+    machines = itertools.groupby(rows, key=lambda row: (row["device"], row["cores"]))
+    return "\n\n".join(_of_machine(list(of_one)) for _, of_one in machines)
+
+
+def _of_machine(rows: list[dict[str, Any]]) -> str:
     one = rows[0]
     lines = [
         f"{one['shots']} drops of a melon on {one['device']} with {one['cores']} cores, "
@@ -235,10 +241,11 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=Path("packing"))
     parser.add_argument("--json", type=Path, help="where the figures go")
     parser.add_argument("--gpus", type=int, nargs="*", help="numbers of GPUs to spread shots over")
-    parser.add_argument("--page", type=Path, metavar="FILE.json", help="only enter these")
+    parser.add_argument("--page", type=Path, nargs="+", metavar="FILE.json", help="only enter")
     options = parser.parse_args()
     if options.page is not None:
-        row = json.loads(options.page.read_text())
+        found = [json.loads(path.read_text()) for path in options.page]
+        row = [r for rows in found for r in rows] if isinstance(found[0], list) else found[0]
         part = "spread" if isinstance(row, list) else "packing"
         heading = "## On several GPUs" if part == "spread" else "## Packed"
         PAGE.write_text(enter(PAGE.read_text(), part, table(row), heading))
