@@ -10,6 +10,7 @@ from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.colliders.patches import FINEST, Patches, rectangle
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.liquid.sheet import CLOSED, TENSION, ellipsoids
+from gsfluent.pipeline.liquid.tearing import in_air
 from gsfluent.scene.scene import Scene
 
 _STEEL = (0.40, 0.41, 0.43)
@@ -37,6 +38,9 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     by the sheet (:mod:`gsfluent.pipeline.liquid.sheet`).
     """
     groups = []
+    stands = [body.solid is not None for body in scene.bodies]
+    wetted = torch.tensor(stands, device=particles.body.device)[particles.body.long()]
+    solid = particles.position[wetted]
     for number, body in enumerate(scene.bodies):
         if body.solid is not None:
             continue
@@ -45,7 +49,9 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
         flows = body.material.law == "fluid"
         paint = _PAINT.get(body.material.name.split(".")[-1], _LIQUID if flows else _STEEL)
         if flows:
-            drawn = ellipsoids(position, volume)
+            edge = float(volume.double().mean()) ** (1.0 / 3.0)
+            free = in_air(position, solid, edge, scene.floor)
+            drawn = ellipsoids(position, volume, free)
             made = _splats(drawn.means, drawn.scales, paint)
             share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
             opacities = torch.full_like(made.opacities, share)

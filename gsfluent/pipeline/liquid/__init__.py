@@ -11,4 +11,5 @@ __getattr__, __dir__, __all__ = room(
     nozzle="WAITING pours",
     parts="LiquidParts",
     sheet="CLOSED TENSION ellipsoids",
+    tearing="in_air",
 )

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from gsfluent.pipeline.liquid.nozzle import held_weights, release_times, waiting
 from gsfluent.pipeline.liquid.spacing import apart
+from gsfluent.pipeline.liquid.tearing import in_air, wetted
 from gsfluent.pipeline.liquid.wetting import Skin, held
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -34,6 +35,7 @@ class Liquids:
         solids = [n for n, body in enumerate(scene.bodies) if body.solid is not None]
         solids = [n for n in solids if n not in flowing]
         self._skin = Skin.of(matter, solids) if flowing and solids else None
+        self._solids, self._floor = wetted(matter, scene), scene.floor
         self._release = release_times(scene, matter, TICK)
         self._active = bool(flowing)
 
@@ -69,11 +71,13 @@ class Liquids:
         return state
 
     def _spaced(self, state: State, rows: Tensor) -> State:
-        """Points that have run together apart again, each liquid for itself."""
+        """Points that have run together apart again, torn sheets drawn together, each liquid."""
         position = state.position.clone()
+        solid = state.position[self._solids]
         for (a, b), spacing in zip(self.matter.ranges, self.matter.spacing, strict=True):
             mine = rows[(rows >= a) & (rows < b)]
             if mine.numel():
-                position[mine] = apart(position[mine], spacing)
+                place = position[mine]
+                position[mine] = apart(place, spacing, in_air(place, solid, spacing, self._floor))
         p = state.particles
         return state._replace(position=position, particles=p.replace(position=position.to(p.dtype)))

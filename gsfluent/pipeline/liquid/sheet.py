@@ -16,6 +16,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.geometry import product, quaternion_to_matrix
 from gsfluent.pipeline.liquid.depth import deep
+from gsfluent.pipeline.liquid.tearing import thinness
 from gsfluent.spatial.neighbours import nearest_rows
 
 REACH = 4.0
@@ -41,6 +42,9 @@ which casts no shadow."""
 FILM = 0.9
 """The same in a film, whose points lie less evenly."""
 
+TORN = 0.75
+"""Standard deviation of a splat of a sheet that tears, at most, in spacings."""
+
 
 class Ellipsoids(NamedTuple):
     """Splats of a liquid.
@@ -60,12 +64,14 @@ class Ellipsoids(NamedTuple):
     apart: Tensor
 
 
-def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
+def ellipsoids(position: Tensor, volume: Tensor, free: Tensor | None = None) -> Ellipsoids:
     """Ellipsoids of the points of one liquid.
 
     Args:
         position: Where the points are [m], [N, 3].
         volume: Their volumes [m^3], [N].
+        free: Points in air, bool [N]; none when absent. Where their sheet is so thin that it tears,
+            splats do not close it.
 
     Returns:
         One splat a point, on the device and of the dtype of ``position``. What is seen of them is
@@ -80,12 +86,14 @@ def ellipsoids(position: Tensor, volume: Tensor) -> Ellipsoids:
     made = _round(position, edge, CLOSED)
     if seen.numel() == 0:
         return made
-    shaped = _shaped(position.double(), seen, edge[seen], spacing)
+    shaped = _shaped(position.double(), seen, edge[seen], spacing, free)
     pairs = zip(made, shaped, strict=True)
     return Ellipsoids(*(a.index_copy(0, seen, b.to(a)) for a, b in pairs))
 
 
-def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> Ellipsoids:
+def _shaped(
+    everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float, free: Tensor | None
+) -> Ellipsoids:
     """Ellipsoids of some points among all."""
     count, places = everywhere.shape[0], everywhere[rows]
     distance, index = nearest_rows(everywhere, places, min(MOST, count), 2.0 * spacing)
@@ -121,6 +129,9 @@ def _shaped(everywhere: Tensor, rows: Tensor, edge: Tensor, spacing: float) -> E
     sheet = reach * (torch.pi / inside[:, None].clamp(min=1.0)).sqrt()
     thin = known * (1.0 - shape[:, 2:]) * (2.0 * shape[:, 1:2]).clamp(max=1.0)
     wide = torch.maximum(scales[:, :2], thin * FILM * sheet)
+    if free is not None:
+        torn = torch.where(free[rows, None], thinness(sheet, spacing), 0.0)
+        wide = torch.lerp(wide, wide.clamp(max=TORN * spacing), torn)
     thick = volume_left / product(wide)[:, None]
     thick = torch.maximum(thick, wide[:, :1] / RATIO)
     thick = torch.minimum(thick, wide[:, 1:])

@@ -3,16 +3,19 @@
 What the grid cannot see - motion of points within its cells - is not resisted by pressure, and
 points of a stretched film gather in clumps and leave holes. They are moved apart as in Ando,
 Thuerey and Tsuruno (2012), pair by pair and equally, so that the centre of mass stays; velocities
-are not touched.
+are not touched. A sheet that tears (:mod:`gsfluent.pipeline.liquid.tearing`) is drawn together into
+strands and drops in the same way.
 """
 
 from __future__ import annotations
 
 import math
 
+import torch
 from torch import Tensor
 
 from gsfluent.pipeline.liquid.depth import deep
+from gsfluent.pipeline.liquid.tearing import DROP, GRASP, thinness
 from gsfluent.spatial.neighbours import nearest_rows
 
 NEIGHBOURS = 12
@@ -20,7 +23,7 @@ SHARE = 0.25
 """Share of what is missing that a pair is moved at a time."""
 
 
-def apart(position: Tensor, spacing: float) -> Tensor:
+def apart(position: Tensor, spacing: float, free: Tensor | None = None) -> Tensor:
     """Positions of points moved away from those that are too near; deep ones are left alone.
 
     Too near is nearer than the mean distance that the twelve nearest neighbours would have in a
@@ -29,6 +32,7 @@ def apart(position: Tensor, spacing: float) -> Tensor:
     Args:
         position: Points of equal mass [m], float64 [N, 3].
         spacing: Their distance inside the liquid [m].
+        free: Points in air, whose sheets tear where they are thin, bool [N]; none when absent.
 
     Returns:
         Where they are put, [N, 3]; their mean is the same.
@@ -45,7 +49,14 @@ def apart(position: Tensor, spacing: float) -> Tensor:
     reach = distance[:, -1].clamp(max=4.0 * spacing) * math.sqrt(math.pi / NEIGHBOURS)
     distance, index = distance[:, 1:], index[:, 1:]
     wanted = 0.5 * (reach[:, None] + reach[index])
-    missing = (1.0 - distance / wanted).clamp(min=0.0) * wanted
+    if free is not None:
+        thin = torch.where(free[rows], thinness(reach, spacing), 0.0)
+        # both ends: what still holds is not drawn into what tears
+        thin = torch.minimum(thin[:, None], thin[index])
+        wanted = torch.lerp(wanted, torch.full_like(wanted, DROP * spacing), thin)
+    missing = wanted - distance
+    pulled = 0.0 if free is None else torch.where(distance < GRASP * spacing, thin * missing, 0.0)
+    missing = torch.where(missing > 0.0, missing, pulled)
     way = (position[:, None] - position[index]) / distance.clamp(min=1e-9 * spacing)[..., None]
     # Each pair is seen from one or both ends: a quarter of it to either end each time.
     push = 0.25 * SHARE * missing[..., None] * way

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from gsfluent.geometry import covariance, quaternion_to_matrix
-from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, ellipsoids
+from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, TORN, ellipsoids
 from gsfluent.pipeline.liquid.spacing import apart
+from gsfluent.pipeline.liquid.tearing import WETS, in_air
 from gsfluent.spatial.blue_noise import blue_cylinder
 from gsfluent.spatial.neighbours import nearest_rows
 
@@ -99,3 +100,50 @@ def test_clumps_come_apart_and_their_middle_stays() -> None:
     assert torch.equal(apart(points[order], H), apart(points, H)[order])
     even = blue_cylinder(0.02, 0.02, H, seed=1)
     assert float((apart(even, H) - even).norm(dim=1).mean()) < 0.02 * H
+
+
+def test_a_thin_sheet_tears_in_air_and_not_on_a_solid() -> None:
+    points = film(1.6, seed=3)
+    free = torch.ones(len(points), dtype=torch.bool)
+
+    def bare(place: Tensor) -> float:
+        """Share of the sheet's places that are far from every point."""
+        rows = middle(points)
+        return float((nearest_rows(place, points[rows], 1, H)[0] > 1.2 * H).double().mean())
+
+    torn = held = points
+    for _ in range(25):
+        torn, held = apart(torn, H, free), apart(held, H, ~free)
+    assert torch.equal(held, apart_times(points, 25))
+    assert torch.allclose(torn.mean(dim=0), points.mean(dim=0), atol=1e-12)
+    # holes open between strands, whose points are nearer than they were
+    assert bare(torn) > 0.05 and bare(held) < 0.01
+    near = nearest_rows(torn, torn, 2, H)[0][:, 1]
+    assert float(near.quantile(0.5)) < 1.0 * H
+    volume = points.new_full((len(points),), VOLUME)
+    rows = middle(points)
+    drawn = ellipsoids(points, volume, free)
+    assert float(drawn.scales[rows].max()) <= TORN * H * (1 + 1e-6)
+    closed = ellipsoids(points, volume, ~free)
+    assert torch.equal(closed.scales, ellipsoids(points, volume).scales)
+    # a sheet that its points can carry does not tear
+    whole = film(0.9)
+    free = torch.ones(len(whole), dtype=torch.bool)
+    inner = middle(whole)
+    assert torch.equal(apart(whole, H, free)[inner], apart(whole, H)[inner])
+
+
+def apart_times(points: Tensor, times: int) -> Tensor:
+    for _ in range(times):
+        points = apart(points, H)
+    return points
+
+
+def test_what_lies_on_the_floor_or_a_solid_is_not_in_air() -> None:
+    height = torch.linspace(0.0, 20 * H, 41, dtype=torch.float64)
+    points = torch.stack([0 * height, 0 * height, height], dim=1)
+    nothing = points[:0]
+    assert bool(in_air(points, nothing, H, None).all())
+    assert torch.equal(in_air(points, nothing, H, 0.0), height > WETS * H)
+    solid = points.new_tensor([[0.0, 0.0, 10.1 * H]])
+    assert torch.equal(in_air(points, solid, H, None), (height - 10.1 * H).abs() > WETS * H)
