@@ -60,6 +60,9 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
       "Tensor? material, float k, float epsilon, bool implicit, float dt=0.0, "
       "bool apart=True) -> (Tensor, Tensor, Tensor, Tensor)");
   m.def("neo_hookean_energy(Tensor strain, Tensor params, Tensor? material) -> Tensor");
+  m.def(
+      "softening_paths(Tensor params, Tensor alpha, Tensor stretch, Tensor first, int steps) -> "
+      "(Tensor, Tensor)");
   // Gradients of strain, alpha, increment, of six material columns per particle, and 1 where they
   // were computed (laws elastic and nacc, no guard).
   m.def(

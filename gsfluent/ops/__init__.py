@@ -15,7 +15,12 @@ __getattr__, __dir__, __all__ = lazy(
         "gsfluent.ops.collider": ("collider_row", "collider_distance", "advance_colliders"),
         "gsfluent.ops.grip": ("grip_rows",),
         "gsfluent.ops.blade": ("blade_rows", "blade_sides", "merged_fields"),
-        "gsfluent.ops.plasticity": ("return_mapping", "elastic_energy", "wave_speed"),
+        "gsfluent.ops.plasticity": (
+            "return_mapping",
+            "elastic_energy",
+            "softening_paths",
+            "wave_speed",
+        ),
         "gsfluent.ops.viscous": ("viscous_step", "viscous_energy"),
         "gsfluent.ops.damage": ("damage_solve",),
         "gsfluent.ops.differentiable": (

@@ -12,7 +12,7 @@ from gsfluent._check import check_tensor
 from gsfluent.materials.laws import LAWS, unstable
 from gsfluent.materials.phase_field import MODELS, SPLITS
 from gsfluent.ops import _plasticity_grad  # noqa: F401  (registers the gradient)
-from gsfluent.ops._register import fakes
+from gsfluent.ops._register import fakes, no_gradient
 from gsfluent.ops.reference import phase_field as phase_reference
 from gsfluent.ops.reference import plasticity as reference
 
@@ -355,7 +355,50 @@ def return_mapping(
     return result[0], result[1], result[2], result[3]
 
 
+def softening_paths(
+    params: Tensor, alpha: Tensor, stretch: Tensor, *, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Work of uniaxial straining until the strength of NACC points is gone.
+
+    Paths of ``steps`` equal steps of :func:`return_mapping` up to ``exp(stretch)`` along x, the
+    other directions held, each summed by the trapezium rule: ``sum of (tau_0 + tau_1) / 2 dln l``.
+
+    Args:
+        params: NACC rows of :func:`return_mapping`, float64 [M, 8], on the CPU.
+        alpha: Where each begins, float64 [M].
+        stretch: Logarithm of the stretch at the end, float64 [M].
+        steps: Steps, at least 1.
+
+    Returns:
+        ``(work, strain)``: [J/m^3], float64 [M], NaN where strength is left at the end; and the
+        elastic strain at which it went, float64 [M, 6], 0 where it did not.
+
+    Raises:
+        TypeError: A tensor has a wrong dtype.
+        ValueError: A shape, device or parameter is wrong, or ``steps``.
+
+    Gradient: none.
+    """
+    op = "softening_paths"
+    check_tensor(op, "params", params, shape=("M", len(PARAM_COLUMNS)), dtype=torch.float64)
+    for name, value in (("alpha", alpha), ("stretch", stretch)):
+        check_tensor(op, name, value, shape=(len(params),), dtype=torch.float64, like=params)
+    if params.device.type != "cpu":
+        raise ValueError(f"{op}: params must lie on the CPU, got {params.device}")
+    if steps < 1:
+        raise ValueError(f"{op}: steps must be at least 1, got {steps}")
+    check_params(op, params.new_full((len(params),), LAWS["nacc"], dtype=torch.int32), params)
+    found: tuple[Tensor, Tensor] = torch.ops.gsfluent.softening_paths.default(
+        params, alpha, stretch, torch.expm1(stretch / steps), steps
+    )
+    return found
+
+
 fakes(
+    softening_paths=lambda params, alpha, stretch, first, steps: (
+        params.new_empty(alpha.shape),
+        params.new_empty((len(alpha), 6)),
+    ),
     return_mapping=lambda strain, alpha, *rest: (
         strain.new_empty(strain.shape),
         strain.new_empty(alpha.shape),
@@ -364,6 +407,7 @@ fakes(
     ),
     neo_hookean_energy=lambda strain, params, material: strain.new_empty(strain.shape[:1]),
 )
+no_gradient("softening_paths: no gradient", "softening_paths")
 _NEO_HOOKEAN = {LAWS["elastic"], LAWS["nacc"]}
 
 

@@ -67,6 +67,8 @@ def calls() -> dict[str, Call]:
         lib.collider_distance(somewhere(5), rows, SDF)
         lib.advance_colliders(rows, torch.randn(2, 6, dtype=torch.float64), 0.1, 0, 0, -9.81)
         lib.mvee(torch.randn(3, 9, 3), 1e-2, 100)
+        nacc = torch.tensor([[1.0, 2.0, 1.5, 0.3, 5.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
+        lib.softening_paths(nacc, *nacc.new_tensor([[-0.1], [0.3], [0.01]]), 30)
         lib.polar_clamped(torch.randn(9, 3, 3), 0.5, 2.0)
         lib.covariance_axes(torch.rand(9, 6))
         near, opened = torch.randint(0, 7, (7, 4)), torch.rand(7, 4) < 0.5
@@ -99,7 +101,7 @@ NAMES = (
     "return_mapping_adjoint rasterize rasterize_backward collider_distance advance_colliders mvee "
     "polar_clamped covariance_axes cut_at_cells cut_by_planes "
     "quats_to_matrices matrices_to_quats quat_products link_states "
-    "margin_counts find_faces face_elements splat_bulk ssim"
+    "margin_counts find_faces face_elements splat_bulk ssim softening_paths"
 ).split()
 
 

@@ -124,21 +124,7 @@ def softening_energies(params: Tensor, alpha: Tensor, *, steps: int = 400) -> Te
     beta, xi = params[:, 3], params[:, 4]
     elastic = beta.clamp(min=1.0) * torch.sinh((-xi * alpha).clamp(max=5.0))
     stretch = -1.5 * alpha + 3.0 * elastic.clamp(max=0.5)
-    strain, a = torch.zeros(count, 6, dtype=torch.float64), alpha.clone()
-    stress, work = torch.zeros_like(strain), torch.zeros_like(alpha)
-    left, spent = strain, torch.full_like(alpha, math.nan)  # where the strength of each went
-    increment = torch.zeros(count, 3, 3, dtype=torch.float64)
-    increment[:, 0, 0] = torch.expm1(stretch / steps)
-    for _ in range(steps):
-        before = stress[:, 0]
-        strain, a, stress, _ = ops.return_mapping(strain, a, increment, law=law, params=params)
-        work = work + 0.5 * (before + stress[:, 0]) * stretch / steps
-        gone = (a >= 0.0) & spent.isnan()
-        if bool(gone.any()):
-            left = torch.where(gone[:, None], strain, left)
-            spent = torch.where(gone, work, spent)
-            if not bool(spent.isnan().any()):
-                break
+    spent, left = ops.softening_paths(params, alpha, stretch, steps=steps)
     return spent - ops.elastic_energy(left, law=law, params=params)
 
 

@@ -7,14 +7,15 @@ guide's space, new in every round, so that no border between two parts can be se
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
-from torch.nn.utils.rnn import pad_sequence
 
 from gsfluent.geometry import ascending
 
@@ -56,6 +57,31 @@ class Cells:
         return torch.cat(parts)
 
 
+@dataclass(frozen=True)
+class _Side:
+    """Rows of some parts, each part's one after the other.
+
+    Attributes:
+        order: Rows by part, int64 [n].
+        starts: Where each part begins there.
+        sizes: Rows of each part.
+    """
+
+    order: Tensor
+    starts: list[int]
+    sizes: list[int]
+
+    def rows(self, some: slice) -> tuple[Tensor, Tensor]:
+        """Rows of parts beside each other, int64 [P, L], and which of them count, bool [P, L].
+
+        Short ones repeat their last row.
+        """
+        ends = torch.tensor([self.starts[some], self.sizes[some]], device=self.order.device)
+        start, size = ends[:, :, None]
+        column = torch.arange(max(self.sizes[some]), device=self.order.device)
+        return self.order[start + column.minimum(size - 1)], column < size
+
+
 class _Parts:
     """Rows that belong together, of all parts of the guide's space with enough on both sides.
 
@@ -67,27 +93,28 @@ class _Parts:
 
     def __init__(self, own: Tensor, other: Tensor, count: int) -> None:
         both = [torch.bincount(part, minlength=count) for part in (own, other)]
-        few, many = torch.stack(both).tolist()
-        enough = [min(pair) >= _LEAST for pair in zip(few, many, strict=True)]
-        self.rows = self._of(own, few, enough)
-        self.sources = self._of(other, many, enough)
-
-    @staticmethod
-    def _of(part: Tensor, sizes: list[int], enough: list[bool]) -> list[Tensor]:
-        rows = part.argsort(stable=True).split(sizes)
-        return [mine for mine, kept in zip(rows, enough, strict=True) if kept]
+        sizes = torch.stack(both).tolist()
+        enough = [min(pair) >= _LEAST for pair in zip(*sizes, strict=True)]
+        self.own, self.other = (
+            _Side(
+                part.argsort(stable=True),
+                list(itertools.compress(itertools.accumulate(each, initial=0), enough)),
+                list(itertools.compress(each, enough)),
+            )
+            for part, each in zip((own, other), sizes, strict=True)
+        )
 
     def together(self, device: torch.device) -> list[slice]:
         """Parts that are worked on in one go."""
         most = _AT_ONCE.get(device.type, _AT_ONCE_ELSEWHERE)
         slices, first, longest = [], 0, 0
-        for k, (mine, source) in enumerate(zip(self.rows, self.sources, strict=True)):
-            size = max(len(mine), len(source))
+        for k, pair in enumerate(zip(self.own.sizes, self.other.sizes, strict=True)):
+            size = max(pair)
             if k > first and (k + 1 - first) * max(longest, size) > most:
                 slices.append(slice(first, k))
                 first, longest = k, 0
             longest = max(longest, size)
-        return [*slices, slice(first, len(self.rows))] if self.rows else []
+        return [*slices, slice(first, len(self.own.sizes))] if self.own.sizes else []
 
 
 def _drawn(size: int, rng: np.random.Generator, limit: int) -> np.ndarray | None:
@@ -95,26 +122,33 @@ def _drawn(size: int, rng: np.random.Generator, limit: int) -> np.ndarray | None
     return (rng.random(limit) * size).astype(np.int64) if size > limit else None
 
 
-def _quantiles(values: list[Tensor], picks: Sequence[np.ndarray | None]) -> Tensor:
-    """Quantiles [P, K, D] of the values [n, D] of each part, or of those picked."""
-    device = values[0].device
-    some = [
-        each if pick is None else each[torch.from_numpy(pick).to(device)]
-        for each, pick in zip(values, picks, strict=True)
-    ]
-    ordered = pad_sequence(some, batch_first=True, padding_value=math.inf)
-    ordered = ascending(ordered.movedim(1, 0)).movedim(0, 1)
-    last = torch.tensor([len(each) - 1 for each in some], device=device)
-    place = torch.stack([torch.linspace(0, len(each) - 1, _KNOTS, device=device) for each in some])
-    low = place.floor().long().minimum(last[:, None])
-    high = (low + 1).minimum(last[:, None])
-    share = (place - low)[..., None]
-    low, high = (at[..., None].expand(-1, -1, ordered.shape[2]) for at in (low, high))
+def _quantiles(values: Tensor, sizes: list[int], picks: Sequence[np.ndarray | None]) -> Tensor:
+    """Quantiles [P, K, D] of the values [P, L, D] of each part, or of those picked."""
+    device, (parts, length, columns) = values.device, values.shape
+    sizes = [n if pick is None else len(pick) for n, pick in zip(sizes, picks, strict=True)]
+    last, most = np.array(sizes)[:, None] - 1, max(sizes)
+    place = np.minimum(np.arange(most), last) + length * np.arange(parts)[:, None]
+    for k, pick in enumerate(picks):
+        if pick is not None:
+            place[k, : len(pick)] = pick + length * k
+    some = values.reshape(-1, columns)[torch.from_numpy(place.reshape(-1)).to(device)]
+    some = some.view(parts, most, columns)
+    if min(sizes) < most:
+        beyond = torch.from_numpy(np.arange(most) > last).to(device)
+        some = some.masked_fill(beyond[..., None], math.inf)
+    ordered = ascending(some.movedim(1, 0)).movedim(0, 1)
+    knots = torch.stack([torch.linspace(0, n - 1, _KNOTS) for n in sizes])
+    low = knots.floor().long().minimum(torch.from_numpy(last))
+    high = (low + 1).minimum(torch.from_numpy(last))
+    share = (knots - low)[..., None].to(device)
+    low, high = (
+        at[..., None].expand(-1, -1, columns) for at in torch.stack([low, high]).to(device)
+    )
     return ordered.gather(1, low) * (1 - share) + ordered.gather(1, high) * share
 
 
-def _shift(values: list[Tensor], have: Tensor, want: Tensor) -> list[Tensor]:
-    """How far the values [n, D] of each part move as quantiles ``have`` become ``want``.
+def _shift(values: Tensor, have: Tensor, want: Tensor) -> Tensor:
+    """How far the values [P, L, D] of each part move as quantiles ``have`` become ``want``.
 
     Both are [P, K, D].
     """
@@ -122,13 +156,12 @@ def _shift(values: list[Tensor], have: Tensor, want: Tensor) -> list[Tensor]:
     # equal quantiles (flat colour) would make the inverse ambiguous
     knots = knots + 1e-5 * torch.arange(_KNOTS, device=knots.device)
     moves = (want - have).mT.contiguous()
-    at = pad_sequence(values, batch_first=True).mT.contiguous()
+    at = values.mT.contiguous()
     right = torch.searchsorted(knots, at).clamp_(1, _KNOTS - 1)
     left_knot, right_knot = knots.gather(2, right - 1), knots.gather(2, right)
     share = ((at - left_knot) / (right_knot - left_knot)).clamp_(0.0, 1.0)
     left, last = moves.gather(2, right - 1), moves.gather(2, right)
-    moved = (left + share * (last - left)).mT
-    return [mine[: len(each)] for mine, each in zip(moved, values, strict=True)]
+    return (left + share * (last - left)).mT
 
 
 def match_near(
@@ -152,30 +185,25 @@ def match_near(
             [
                 (
                     np.linalg.qr(rng.standard_normal((3, 3)))[0],
-                    _drawn(len(mine), rng, 16384),
-                    _drawn(len(source), rng, 16384),
+                    _drawn(mine, rng, 16384),
+                    _drawn(source, rng, 16384),
                 )
                 for _ in range(_ROTATIONS)
             ]
-            for mine, source in zip(parts.rows, parts.sources, strict=True)
+            for mine, source in zip(parts.own.sizes, parts.other.sizes, strict=True)
         ]
         moved = values.clone()
         for some in parts.together(values.device):
-            rows, part = parts.rows[some], [values[mine] for mine in parts.rows[some]]
-            sources = [reference[source] for source in parts.sources[some]]
+            (rows, there), sources = parts.own.rows(some), parts.other.rows(some)[0]
+            part, source = values[rows], reference[sources]
             for drawn in zip(*draws[some], strict=True):
                 matrices, own_picks, other_picks = zip(*drawn, strict=True)
                 bases = torch.from_numpy(np.stack(matrices)).to(values)
-                turned = [each @ basis for each, basis in zip(part, bases, strict=True)]
-                goal = [each @ basis for each, basis in zip(sources, bases, strict=True)]
-                have, want = _quantiles(turned, own_picks), _quantiles(goal, other_picks)
-                part = [
-                    each + shift @ basis.T
-                    for each, shift, basis in zip(
-                        part, _shift(turned, have, want), bases, strict=True
-                    )
-                ]
-            moved[torch.cat(rows)] = torch.cat(part)
+                turned = part @ bases
+                have = _quantiles(turned, parts.own.sizes[some], own_picks)
+                want = _quantiles(source @ bases, parts.other.sizes[some], other_picks)
+                part = part + _shift(turned, have, want) @ bases.mT
+            moved[rows[there]] = part[there]
         total += moved
     return total / repeats
 
@@ -232,17 +260,18 @@ def polish_patches(
             own = cells.of(own_guide[:, position].T.contiguous())
             parts = _Parts(own, cells.of(patch_guide), len(cells.centers))
             picks = [
-                (_drawn(len(mine), rng, 4096), _drawn(len(source), rng, 4096))
-                for mine, source in zip(parts.rows, parts.sources, strict=True)
+                (_drawn(mine, rng, 4096), _drawn(source, rng, 4096))
+                for mine, source in zip(parts.own.sizes, parts.other.sizes, strict=True)
             ]
             reference = patches @ kernel
             moves = torch.zeros_like(flat)
             for some in parts.together(flat.device):
                 own_picks, other_picks = zip(*picks[some], strict=True)
-                part = [flat[mine] for mine in parts.rows[some]]
-                goal = [reference[source] for source in parts.sources[some]]
-                have, want = _quantiles(part, own_picks), _quantiles(goal, other_picks)
-                moves[torch.cat(parts.rows[some])] = torch.cat(_shift(part, have, want))
+                (rows, there), sources = parts.own.rows(some), parts.other.rows(some)[0]
+                part = flat[rows]
+                have = _quantiles(part, parts.own.sizes[some], own_picks)
+                want = _quantiles(reference[sources], parts.other.sizes[some], other_picks)
+                moves[rows[there]] = _shift(part, have, want)[there]
             spread = torch.zeros(filters, mask.numel(), device=volume.device)
             spread[:, position] = moves.T
             spread = spread.reshape(filters, *mask.shape).permute(1, 0, 2, 3)
