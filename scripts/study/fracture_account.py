@@ -6,7 +6,8 @@
 
 The watermelon of ``fracture_resolution.py``, step by step. The law's stress and that of the
 relaxing spring work on the velocity gradient of every point; what of the work is not stored is
-plastic, or relaxed. Plastic work is told apart by the sign of the pressure under which it is done.
+plastic, or relaxed. A spring that the yield surface brings back loses plastic work, too. It is told
+apart by the sign of the pressure under which it is done.
 What the ledger of energies lacks beyond that is lost between points and nodes and on the floor.
 One JSON line per fall; the table is entered into the page of the resolution.
 """
@@ -36,6 +37,8 @@ from gsfluent.pipeline.matter.weld import crushed
 from gsfluent.pipeline.simulate.stage import Simulate
 
 OUT = LINES.with_name("fracture_account.jsonl")
+ROUNDING = 16.0
+"""Units of the last place by which strains of springs may differ and are the same."""
 
 
 class Account:
@@ -62,7 +65,7 @@ class Account:
         self._plain = torch.zeros_like(matter.params)
         self._plain[:, :2] = matter.params[:, :2]
         self._last = state
-        self._held, self._stress = self._energies(state), self._stresses(state)
+        self._held, self._stress = self._energies(state), self._shared(self._stresses(state), state)
 
     def __call__(self, state: State) -> State:
         """Add the work of the step just made: stress before it on the gradient after it."""
@@ -77,14 +80,18 @@ class Account:
             ],
             dim=1,
         )  # fmt: skip
-        held, stress = self._energies(state), self._stresses(state)
+        raw = self._stresses(state)
+        held, stress = self._energies(state), self._shared(raw, state)
         volume = dt * after.volume.double()
         law, spring = ((s * rate).sum(dim=1).double() * volume for s in self._stress)
         plastic = law - (held[0] - self._held[0])
         tension = self._stress[0][:, :3].sum(dim=1) > 0.0
         self.torn += torch.where(tension, plastic, 0.0)
         self.pressed += torch.where(tension, 0.0, plastic)
-        self.relaxed += spring - (held[1] - self._held[1])
+        let_go, pulled = self._let_go(self._last, state, rate=c * dt, law=raw[0], dt=dt)
+        self.torn += torch.where(pulled, let_go, 0.0)
+        self.pressed += torch.where(pulled, 0.0, let_go)
+        self.relaxed += spring - (held[1] - self._held[1]) - let_go
         self._last, self._held, self._stress = state, held, stress
         return state
 
@@ -108,19 +115,63 @@ class Account:
         return p.viscous[:, 6], p.viscous[:, :6]
 
     def _stresses(self, state: State) -> tuple[Tensor, Tensor]:
-        """Stress of law and spring, each with its share [Pa]."""
+        """Stress of law and spring, as if each had all of the stiffness [Pa]."""
         assert self.matter is not None
         p, m = state.particles, self.matter
-        share, spring = self._shares(state)
         still = torch.zeros_like(p.affine)
         law = ops.return_mapping(
             p.strain, p.alpha, still, law=m.law, params=m.params, material=p.material, dt=1.0
         )[2]
-        held = ops.return_mapping(
-            spring, torch.zeros_like(p.alpha), still, law=self._elastic, params=self._plain,
-            material=p.material, dt=1.0,
+        return law, self._elastic_stress(self._shares(state)[1], state)
+
+    def _elastic_stress(self, strain: Tensor, state: State) -> Tensor:
+        """Of springs [Pa]."""
+        p = state.particles
+        return ops.return_mapping(
+            strain, torch.zeros_like(p.alpha), torch.zeros_like(p.affine), law=self._elastic,
+            params=self._plain, material=p.material, dt=1.0,
         )[2]  # fmt: skip
-        return (1.0 - share[:, None]) * law, share[:, None] * held
+
+    def _shared(self, stress: tuple[Tensor, Tensor], state: State) -> tuple[Tensor, Tensor]:
+        """The same, each with its share of the stiffness."""
+        share = self._shares(state)[0][:, None]
+        return (1.0 - share) * stress[0], share * stress[1]
+
+    def _let_go(
+        self, before: State, after: State, *, rate: Tensor, law: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor]:
+        """What springs lost on the yield surface in a step [J], float64 [N], and whether in tension.
+
+        A spring holds no more than broken matter does (docs/theory/viscous.md): what it stored
+        before it was brought back, less what it has.
+
+        Args:
+            before: State before the step.
+            after: After it.
+            rate: Velocity gradient times the step, [N, 3, 3].
+            law: Stress of the law after it, with all of the stiffness [Pa], [N, 6].
+            dt: [s].
+        """
+        assert self.matter is not None
+        p, q = before.particles, after.particles
+        if p.viscous is None or q.viscous is None:
+            none = torch.zeros_like(p.mass, dtype=torch.float64)
+            return none, none > 0.0
+        trial = ops.viscous_step(
+            p.viscous, p.strain, p.alpha, rate, (q.strain, q.alpha, law),
+            law=self._elastic, params=self._plain, material=p.material, dt=dt,
+        )[0][:, :6].contiguous()  # fmt: skip
+        now = q.viscous[:, :6].contiguous()
+        stored = [
+            ops.elastic_energy(
+                e.double(), law=self._elastic, params=self._plain.double(), material=p.material
+            )
+            for e in (trial, now)
+        ]
+        yielded = (trial - now).abs().amax(dim=1) > ROUNDING * torch.finfo(now.dtype).eps
+        volume = q.viscous[:, 6].double() * q.volume.double()
+        lost = torch.where(yielded, volume * (stored[0] - stored[1]), 0.0)
+        return lost, self._elastic_stress(trial, after)[:, :3].sum(dim=1) > 0.0
 
 
 def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
