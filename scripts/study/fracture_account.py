@@ -88,10 +88,12 @@ class Account:
         tension = self._stress[0][:, :3].sum(dim=1) > 0.0
         self.torn += torch.where(tension, plastic, 0.0)
         self.pressed += torch.where(tension, 0.0, plastic)
-        let_go, pulled = self._let_go(self._last, state, rate=c * dt, law=raw[0], dt=dt)
+        lost = spring - (held[1] - self._held[1])
+        yielded, pulled, faded = self._yielding(self._last, state, rate=c * dt, law=raw[0], dt=dt)
+        let_go = torch.where(yielded, lost - faded, 0.0)
         self.torn += torch.where(pulled, let_go, 0.0)
         self.pressed += torch.where(pulled, 0.0, let_go)
-        self.relaxed += spring - (held[1] - self._held[1]) - let_go
+        self.relaxed += lost - let_go
         self._last, self._held, self._stress = state, held, stress
         return state
 
@@ -137,13 +139,13 @@ class Account:
         share = self._shares(state)[0][:, None]
         return (1.0 - share) * stress[0], share * stress[1]
 
-    def _let_go(
+    def _yielding(
         self, before: State, after: State, *, rate: Tensor, law: Tensor, dt: float
-    ) -> tuple[Tensor, Tensor]:
-        """What springs lost on the yield surface in a step [J], float64 [N], and whether in tension.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Springs that the yield surface brought back in a step, and what they relaxed besides.
 
-        A spring holds no more than broken matter does (docs/theory/viscous.md): what it stored
-        before it was brought back, less what it has.
+        A spring holds no more than broken matter does (docs/theory/viscous.md): what it loses there
+        is plastic work.
 
         Args:
             before: State before the step.
@@ -151,27 +153,34 @@ class Account:
             rate: Velocity gradient times the step, [N, 3, 3].
             law: Stress of the law after it, with all of the stiffness [Pa], [N, 6].
             dt: [s].
+
+        Returns:
+            Whether a spring yielded and whether it was in tension, bool [N]; what relaxed of it in
+            the step [J], float64 [N].
         """
         assert self.matter is not None
         p, q = before.particles, after.particles
         if p.viscous is None or q.viscous is None:
             none = torch.zeros_like(p.mass, dtype=torch.float64)
-            return none, none > 0.0
+            return none > 0.0, none > 0.0, none
+        options: dict[str, Any] = {
+            "law": self._elastic,
+            "params": self._plain,
+            "material": p.material,
+        }
+        old, now = p.viscous[:, :6].contiguous(), q.viscous[:, :6].contiguous()
+        y = 0.5 * dt * p.viscous[:, 7:8].clamp(min=0.0)
+        half = old / (1.0 + y * (1.0 + 0.5 * y))
+        moved = ops.return_mapping(half, torch.zeros_like(p.alpha), rate, dt=dt, **options)[0]
         trial = ops.viscous_step(
-            p.viscous, p.strain, p.alpha, rate, (q.strain, q.alpha, law),
-            law=self._elastic, params=self._plain, material=p.material, dt=dt,
-        )[0][:, :6].contiguous()  # fmt: skip
-        now = q.viscous[:, :6].contiguous()
-        stored = [
-            ops.elastic_energy(
-                e.double(), law=self._elastic, params=self._plain.double(), material=p.material
-            )
-            for e in (trial, now)
-        ]
+            p.viscous, p.strain, p.alpha, rate, (q.strain, q.alpha, law), dt=dt, **options
+        )[0][:, :6].contiguous()
         yielded = (trial - now).abs().amax(dim=1) > ROUNDING * torch.finfo(now.dtype).eps
+        options["params"] = self._plain.double()
+        stored = [ops.elastic_energy(e.double(), **options) for e in (old, half, moved, trial)]
         volume = q.viscous[:, 6].double() * q.volume.double()
-        lost = torch.where(yielded, volume * (stored[0] - stored[1]), 0.0)
-        return lost, self._elastic_stress(trial, after)[:, :3].sum(dim=1) > 0.0
+        faded = volume * (stored[0] - stored[1] + stored[2] - stored[3])
+        return yielded, self._elastic_stress(trial, after)[:, :3].sum(dim=1) > 0.0, faded
 
 
 def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:

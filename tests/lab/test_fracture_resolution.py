@@ -137,8 +137,8 @@ def test_the_account_of_a_torn_point_counts_what_its_spring_loses() -> None:
     plain, work, stored = stretched(0.0, 0.0)
     assert float(plain.torn) == pytest.approx(wanted, rel=1e-2)
     kept, *_ = stretched(0.75, 0.0)  # a spring that never relaxes is not there
-    assert float(kept.torn) == pytest.approx(float(plain.torn), rel=2e-2)
-    assert abs(float(kept.relaxed)) < 2e-2 * float(kept.torn)  # steps are explicit
+    assert float(kept.torn) == pytest.approx(float(plain.torn), rel=3e-3)
+    assert abs(float(kept.relaxed)) < 3e-3 * float(kept.torn)  # steps are explicit
     slow, work, stored = stretched(0.75, 2e-3)
     assert float(slow.torn) < float(plain.torn) and float(slow.relaxed) > 0.0
     parts = float(slow.torn + slow.pressed + slow.relaxed)
