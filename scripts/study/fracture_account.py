@@ -2,7 +2,8 @@
 
     python scripts/study/fracture_account.py               # ten minutes of one core; resumable
     python scripts/study/fracture_account.py --cells 16 --heights 3
-    python scripts/study/fracture_account.py --cells 24,32,40 --device cuda    # three minutes
+    python scripts/study/fracture_account.py --cells 20,32,40 --device cuda    # three minutes
+    python scripts/study/fracture_account.py --paths       # what matter takes by how it is strained
 
 The watermelon of ``fracture_resolution.py``, step by step. The law's stress and that of the
 relaxing spring work on the velocity gradient of every point; what of the work is not stored is
@@ -30,7 +31,9 @@ from gsfluent import materials, ops
 from gsfluent.figure.markdown import enter
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import machine
+from gsfluent.lab.problems.fracture.energy import rows_of
 from gsfluent.ops.plasticity import LAWS
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.matter.weld import crushed
@@ -218,6 +221,76 @@ def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     }  # fmt: skip
 
 
+SPACINGS = {
+    "fruit.watermelon": 0.0125, "fruit.apple": 0.0025, "glass": 5e-4, "plaster": 2e-3,
+    "bread": 5e-3,
+}  # fmt: skip
+"""Node spacings of the table of paths [m], on which strengths are kept."""
+OPENED = (1.0, 0.0, 0.0)
+
+
+def energy_of_path(
+    row: Tensor, alpha: Tensor, before: tuple[float, float, float], steps: int = 4000
+) -> float:
+    """What a point takes that is strained until it yields and then opened until it is broken.
+
+    A crack is a band of which the sides are held by what is beside it, so once it yields it opens
+    along x alone.
+
+    Args:
+        row: Of NACC, float64 [1, 8].
+        alpha: Its alpha0, float64 [1].
+        before: Strains along x, y and z until it yields, in units of that along x.
+        steps: That the opening takes, about.
+
+    Returns:
+        Work less what is stored at the end [J/m^3].
+
+    Raises:
+        ValueError: It does not yield, or does not break.
+    """
+    law = torch.tensor([LAWS["nacc"]], dtype=torch.int32)
+    strain, stress, now = torch.zeros(1, 6).double(), torch.zeros(1, 6).double(), alpha
+    work, way = 0.0, torch.tensor(before, dtype=torch.float64)
+    # what it holds over its stiffness; 20 times the opening that uses up alpha0
+    limit = float(row[0, 3] * torch.sinh(-row[0, 4] * alpha[0]))
+    size = min(limit / 500.0, -float(alpha[0]) / steps)
+    for _ in range(40 * steps):
+        increment = torch.diag(torch.expm1(size * way))[None]
+        strain, later, after, _ = ops.return_mapping(
+            strain, now, increment, law=law, params=row, dt=1.0
+        )
+        work += 0.5 * size * float(((stress + after)[0, :3] * way).sum())
+        if bool(later != now):
+            way, size = torch.tensor(OPENED, dtype=torch.float64), -float(alpha[0]) / steps
+        now, stress = later, after
+        if float(now) >= 0.0:
+            return work - float(ops.elastic_energy(strain, law=law, params=row))
+    raise ValueError(f"energy_of_path: not broken by strains {before}; take other ones")
+
+
+def paths_table(steps: int = 4000) -> str:
+    """Markdown: energies of presets over the one that G_c stands for, by how they are strained."""
+    head = (
+        "material", "Poisson's ratio", "sides held", "sides free, then held",
+        "one side free, then held", "pulled along two axes, then held", "sheared, then opened",
+    )  # fmt: skip
+    out = []
+    for name, dx in SPACINGS.items():
+        preset = materials.get(name)
+        row, _, alpha = rows_of(preset, torch.ones(1, dtype=torch.float64), dx)
+        nu = float(preset.poisson_ratio)  # type: ignore[arg-type]
+        free = -2.0 * nu / (1.0 - nu)
+        ways = (
+            OPENED, (1.0, -nu, -nu), (1.0, -nu / (1.0 - nu), 0.0), (1.0, 1.0, free),
+            (1.0, -1.0, 0.0),
+        )  # fmt: skip
+        found = [energy_of_path(row, alpha, way, steps) for way in ways]
+        target = float(preset.fracture_energy or 0.0) / (BAND_CELLS * dx)
+        out.append([name, f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
+    return table(head, out)
+
+
 def page_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: every fall."""
     head = (
@@ -244,6 +317,13 @@ def page_table(rows: list[dict[str, Any]]) -> str:
     return table(head, out)
 
 
+def put(name: str, text: str) -> None:
+    """Enter a table into the page."""
+    page = enter(PAGE.read_text(encoding="utf-8"), name, text)
+    with atomic_path(PAGE) as file:
+        file.write_text(page, encoding="utf-8")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run it."""
     parser = argparse.ArgumentParser(
@@ -254,7 +334,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--heights", type=float, nargs="+", default=[0.75, 3.0])
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--paths", action="store_true", help="only the table of paths")
     args = parser.parse_args(argv)
+    if args.paths:
+        put("fracture resolution paths", paths_table())
+        return 0
     done = {(r["height"], r["cells"], r["seed"]) for r in read(args.out)}
     for cells in args.cells:
         for height in args.heights:
@@ -266,12 +350,7 @@ def main(argv: list[str] | None = None) -> int:
                 with args.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
     if args.out == OUT:
-        text = enter(
-            PAGE.read_text(encoding="utf-8"), "fracture resolution account",
-            page_table(read(args.out)),
-        )  # fmt: skip
-        with atomic_path(PAGE) as file:
-            file.write_text(text, encoding="utf-8")
+        put("fracture resolution account", page_table(read(args.out)))
     return 0
 
 

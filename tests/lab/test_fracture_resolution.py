@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsfluent import materials, ops
 from gsfluent.lab.problems.fracture.energy import rows_of
-from gsfluent.pipeline.matter.crack_band import BAND_CELLS
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS, softening_energy
 from gsfluent.pipeline.matter.fragments import rest_links
 
 study = load_script("study/fracture_resolution")
@@ -143,6 +143,20 @@ def test_the_account_of_a_torn_point_counts_what_its_spring_loses() -> None:
     assert float(slow.torn) < float(plain.torn) and float(slow.relaxed) > 0.0
     parts = float(slow.torn + slow.pressed + slow.relaxed)
     assert parts == pytest.approx(work - stored, rel=1e-10)
+
+
+def test_what_a_point_takes_hangs_on_how_it_was_strained_before() -> None:
+    account = load_script("study/fracture_account")
+    row, _, alpha = rows_of(
+        materials.get("fruit.watermelon"), torch.ones(1, dtype=torch.float64), 0.0125
+    )
+    held = account.energy_of_path(row, alpha, account.OPENED, 400)
+    assert held == pytest.approx(softening_energy(row[0], float(alpha[0])), rel=1e-2)
+    pulled = account.energy_of_path(row, alpha, (1.0, -0.32, -0.32), 400)
+    sheared = account.energy_of_path(row, alpha, (1.0, -1.0, 0.0), 400)
+    assert held < 0.6 * pulled < 0.2 * sheared
+    with pytest.raises(ValueError, match="not broken"):
+        account.energy_of_path(row, alpha, (0.0, 0.0, 0.0), 10)
 
 
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
