@@ -41,6 +41,7 @@ from gsfluent.fracturebench.scenes.rock import experiment
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.problems.fracture.dissipation import Dissipation
+from gsfluent.lab.problems.fracture.energy import TENSILE, open_slowly
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.stepper import Stepper
 
@@ -311,6 +312,24 @@ def verdict(measures: Iterable[Measure]) -> str:
     return f"{sum(passed)} of {len(passed)} pass"
 
 
+def flanks(quick: bool) -> list[str]:
+    """Rows of the table of what matter beside the cantilever's crack takes."""
+    rows = [
+        "| strength in compression over that in tension | dx | energy over G_c | of matter that "
+        "broke | of matter beside it |",
+        "|---|---|---|---|---|",
+    ]
+    for ratio, cells in ((10.0, (32, 48, 64, 96)), (2.0, (32, 48, 64))):
+        for n in cells[: 1 if quick else None]:
+            crack = open_slowly(n, shift=0.25, compressive=ratio * TENSILE)
+            rows.append(
+                f"| {ratio:g} | 1/{n} m | {crack.energy:.2f} | "
+                f"{crack.energy - crack.beside:.2f} | {crack.beside:.2f} |"
+            )
+            sys.stderr.write(f"{rows[-1]}\n")
+    return rows
+
+
 def strengths(quick: bool) -> list[str]:
     """Rows of the table of pressed rock, and what a strength without a rate can reach."""
     case = find("rock_press")
@@ -362,7 +381,8 @@ CHOSEN: dict[str, Callable[[bool, Sequence[str]], list[str]]] = {
 """Tables of which some rows may be run, the others being those of the page."""
 TABLES: dict[str, Callable[[bool], list[str]]] = {
     "notch_loads": speeds, "cantilever_loads": energies, "cantilever_account": accounts,
-    "grid_place": places, "rock_strength": strengths, "rock_shapes": shapes,
+    "cantilever_flanks": flanks, "grid_place": places, "rock_strength": strengths,
+    "rock_shapes": shapes,
 }  # fmt: skip
 
 

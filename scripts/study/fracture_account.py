@@ -2,11 +2,13 @@
 
     python scripts/study/fracture_account.py               # ten minutes of one core; resumable
     python scripts/study/fracture_account.py --cells 16 --heights 3
-    python scripts/study/fracture_account.py --cells 24,32,40 --device cuda    # three minutes
+    python scripts/study/fracture_account.py --cells 20,32,40 --device cuda    # three minutes
+    python scripts/study/fracture_account.py --paths       # what matter takes by how it is strained
 
 The watermelon of ``fracture_resolution.py``, step by step. The law's stress and that of the
 relaxing spring work on the velocity gradient of every point; what of the work is not stored is
-plastic, or relaxed. Plastic work is told apart by the sign of the pressure under which it is done.
+plastic, or relaxed. A spring that the yield surface brings back loses plastic work, too. It is told
+apart by the sign of the pressure under which it is done.
 What the ledger of energies lacks beyond that is lost between points and nodes and on the floor.
 One JSON line per fall; the table is entered into the page of the resolution.
 """
@@ -29,13 +31,17 @@ from gsfluent import materials, ops
 from gsfluent.figure.markdown import enter
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import machine
+from gsfluent.lab.problems.fracture.energy import rows_of
 from gsfluent.ops.plasticity import LAWS
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
 from gsfluent.pipeline.matter.weld import crushed
 from gsfluent.pipeline.simulate.stage import Simulate
 
 OUT = LINES.with_name("fracture_account.jsonl")
+ROUNDING = 16.0
+"""Units of the last place by which strains of springs may differ and are the same."""
 
 
 class Account:
@@ -62,7 +68,7 @@ class Account:
         self._plain = torch.zeros_like(matter.params)
         self._plain[:, :2] = matter.params[:, :2]
         self._last = state
-        self._held, self._stress = self._energies(state), self._stresses(state)
+        self._held, self._stress = self._energies(state), self._shared(self._stresses(state), state)
 
     def __call__(self, state: State) -> State:
         """Add the work of the step just made: stress before it on the gradient after it."""
@@ -77,14 +83,20 @@ class Account:
             ],
             dim=1,
         )  # fmt: skip
-        held, stress = self._energies(state), self._stresses(state)
+        raw = self._stresses(state)
+        held, stress = self._energies(state), self._shared(raw, state)
         volume = dt * after.volume.double()
         law, spring = ((s * rate).sum(dim=1).double() * volume for s in self._stress)
         plastic = law - (held[0] - self._held[0])
         tension = self._stress[0][:, :3].sum(dim=1) > 0.0
         self.torn += torch.where(tension, plastic, 0.0)
         self.pressed += torch.where(tension, 0.0, plastic)
-        self.relaxed += spring - (held[1] - self._held[1])
+        lost = spring - (held[1] - self._held[1])
+        yielded, pulled, faded = self._yielding(self._last, state, rate=c * dt, law=raw[0], dt=dt)
+        let_go = torch.where(yielded, lost - faded, 0.0)
+        self.torn += torch.where(pulled, let_go, 0.0)
+        self.pressed += torch.where(pulled, 0.0, let_go)
+        self.relaxed += lost - let_go
         self._last, self._held, self._stress = state, held, stress
         return state
 
@@ -108,19 +120,70 @@ class Account:
         return p.viscous[:, 6], p.viscous[:, :6]
 
     def _stresses(self, state: State) -> tuple[Tensor, Tensor]:
-        """Stress of law and spring, each with its share [Pa]."""
+        """Stress of law and spring, as if each had all of the stiffness [Pa]."""
         assert self.matter is not None
         p, m = state.particles, self.matter
-        share, spring = self._shares(state)
         still = torch.zeros_like(p.affine)
         law = ops.return_mapping(
             p.strain, p.alpha, still, law=m.law, params=m.params, material=p.material, dt=1.0
         )[2]
-        held = ops.return_mapping(
-            spring, torch.zeros_like(p.alpha), still, law=self._elastic, params=self._plain,
-            material=p.material, dt=1.0,
+        return law, self._elastic_stress(self._shares(state)[1], state)
+
+    def _elastic_stress(self, strain: Tensor, state: State) -> Tensor:
+        """Of springs [Pa]."""
+        p = state.particles
+        return ops.return_mapping(
+            strain, torch.zeros_like(p.alpha), torch.zeros_like(p.affine), law=self._elastic,
+            params=self._plain, material=p.material, dt=1.0,
         )[2]  # fmt: skip
-        return (1.0 - share[:, None]) * law, share[:, None] * held
+
+    def _shared(self, stress: tuple[Tensor, Tensor], state: State) -> tuple[Tensor, Tensor]:
+        """The same, each with its share of the stiffness."""
+        share = self._shares(state)[0][:, None]
+        return (1.0 - share) * stress[0], share * stress[1]
+
+    def _yielding(
+        self, before: State, after: State, *, rate: Tensor, law: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Springs that the yield surface brought back in a step, and what they relaxed besides.
+
+        A spring holds no more than broken matter does (docs/theory/viscous.md): what it loses there
+        is plastic work.
+
+        Args:
+            before: State before the step.
+            after: After it.
+            rate: Velocity gradient times the step, [N, 3, 3].
+            law: Stress of the law after it, with all of the stiffness [Pa], [N, 6].
+            dt: [s].
+
+        Returns:
+            Whether a spring yielded and whether it was in tension, bool [N]; what relaxed of it in
+            the step [J], float64 [N].
+        """
+        assert self.matter is not None
+        p, q = before.particles, after.particles
+        if p.viscous is None or q.viscous is None:
+            none = torch.zeros_like(p.mass, dtype=torch.float64)
+            return none > 0.0, none > 0.0, none
+        options: dict[str, Any] = {
+            "law": self._elastic,
+            "params": self._plain,
+            "material": p.material,
+        }
+        old, now = p.viscous[:, :6].contiguous(), q.viscous[:, :6].contiguous()
+        y = 0.5 * dt * p.viscous[:, 7:8].clamp(min=0.0)
+        half = old / (1.0 + y * (1.0 + 0.5 * y))
+        moved = ops.return_mapping(half, torch.zeros_like(p.alpha), rate, dt=dt, **options)[0]
+        trial = ops.viscous_step(
+            p.viscous, p.strain, p.alpha, rate, (q.strain, q.alpha, law), dt=dt, **options
+        )[0][:, :6].contiguous()
+        yielded = (trial - now).abs().amax(dim=1) > ROUNDING * torch.finfo(now.dtype).eps
+        options["params"] = self._plain.double()
+        stored = [ops.elastic_energy(e.double(), **options) for e in (old, half, moved, trial)]
+        volume = q.viscous[:, 6].double() * q.volume.double()
+        faded = volume * (stored[0] - stored[1] + stored[2] - stored[3])
+        return yielded, self._elastic_stress(trial, after)[:, :3].sum(dim=1) > 0.0, faded
 
 
 def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
@@ -158,6 +221,76 @@ def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     }  # fmt: skip
 
 
+SPACINGS = {
+    "fruit.watermelon": 0.0125, "fruit.apple": 0.0025, "glass": 5e-4, "plaster": 2e-3,
+    "bread": 5e-3,
+}  # fmt: skip
+"""Node spacings of the table of paths [m], on which strengths are kept."""
+OPENED = (1.0, 0.0, 0.0)
+
+
+def energy_of_path(
+    row: Tensor, alpha: Tensor, before: tuple[float, float, float], steps: int = 4000
+) -> float:
+    """What a point takes that is strained until it yields and then opened until it is broken.
+
+    A crack is a band of which the sides are held by what is beside it, so once it yields it opens
+    along x alone.
+
+    Args:
+        row: Of NACC, float64 [1, 8].
+        alpha: Its alpha0, float64 [1].
+        before: Strains along x, y and z until it yields, in units of that along x.
+        steps: That the opening takes, about.
+
+    Returns:
+        Work less what is stored at the end [J/m^3].
+
+    Raises:
+        ValueError: It does not yield, or does not break.
+    """
+    law = torch.tensor([LAWS["nacc"]], dtype=torch.int32)
+    strain, stress, now = torch.zeros(1, 6).double(), torch.zeros(1, 6).double(), alpha
+    work, way = 0.0, torch.tensor(before, dtype=torch.float64)
+    # what it holds over its stiffness; 20 times the opening that uses up alpha0
+    limit = float(row[0, 3] * torch.sinh(-row[0, 4] * alpha[0]))
+    size = min(limit / 500.0, -float(alpha[0]) / steps)
+    for _ in range(40 * steps):
+        increment = torch.diag(torch.expm1(size * way))[None]
+        strain, later, after, _ = ops.return_mapping(
+            strain, now, increment, law=law, params=row, dt=1.0
+        )
+        work += 0.5 * size * float(((stress + after)[0, :3] * way).sum())
+        if bool(later != now):
+            way, size = torch.tensor(OPENED, dtype=torch.float64), -float(alpha[0]) / steps
+        now, stress = later, after
+        if float(now) >= 0.0:
+            return work - float(ops.elastic_energy(strain, law=law, params=row))
+    raise ValueError(f"energy_of_path: not broken by strains {before}; take other ones")
+
+
+def paths_table(steps: int = 4000) -> str:
+    """Markdown: energies of presets over the one that G_c stands for, by how they are strained."""
+    head = (
+        "material", "Poisson's ratio", "sides held", "sides free, then held",
+        "one side free, then held", "pulled along two axes, then held", "sheared, then opened",
+    )  # fmt: skip
+    out = []
+    for name, dx in SPACINGS.items():
+        preset = materials.get(name)
+        row, _, alpha = rows_of(preset, torch.ones(1, dtype=torch.float64), dx)
+        nu = float(preset.poisson_ratio)  # type: ignore[arg-type]
+        free = -2.0 * nu / (1.0 - nu)
+        ways = (
+            OPENED, (1.0, -nu, -nu), (1.0, -nu / (1.0 - nu), 0.0), (1.0, 1.0, free),
+            (1.0, -1.0, 0.0),
+        )  # fmt: skip
+        found = [energy_of_path(row, alpha, way, steps) for way in ways]
+        target = float(preset.fracture_energy or 0.0) / (BAND_CELLS * dx)
+        out.append([name, f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
+    return table(head, out)
+
+
 def page_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: every fall."""
     head = (
@@ -184,6 +317,13 @@ def page_table(rows: list[dict[str, Any]]) -> str:
     return table(head, out)
 
 
+def put(name: str, text: str) -> None:
+    """Enter a table into the page."""
+    page = enter(PAGE.read_text(encoding="utf-8"), name, text)
+    with atomic_path(PAGE) as file:
+        file.write_text(page, encoding="utf-8")
+
+
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run it."""
     parser = argparse.ArgumentParser(
@@ -194,7 +334,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--heights", type=float, nargs="+", default=[0.75, 3.0])
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--paths", action="store_true", help="only the table of paths")
     args = parser.parse_args(argv)
+    if args.paths:
+        put("fracture resolution paths", paths_table())
+        return 0
     done = {(r["height"], r["cells"], r["seed"]) for r in read(args.out)}
     for cells in args.cells:
         for height in args.heights:
@@ -206,12 +350,7 @@ def main(argv: list[str] | None = None) -> int:
                 with args.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")
     if args.out == OUT:
-        text = enter(
-            PAGE.read_text(encoding="utf-8"), "fracture resolution account",
-            page_table(read(args.out)),
-        )  # fmt: skip
-        with atomic_path(PAGE) as file:
-            file.write_text(text, encoding="utf-8")
+        put("fracture resolution account", page_table(read(args.out)))
     return 0
 
 

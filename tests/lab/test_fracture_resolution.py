@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from loaded_scripts import load_script
+from torch import Tensor
 
+from gsfluent import materials, ops
+from gsfluent.lab.problems.fracture.energy import rows_of
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS, softening_energy
 from gsfluent.pipeline.matter.fragments import rest_links
 
 study = load_script("study/fracture_resolution")
@@ -82,6 +88,75 @@ def test_the_account_of_a_fall_adds_up() -> None:
     assert 0.75 * row["dissipated"] < sum(parts) < row["dissipated"]
     assert row["relaxed"] == max(parts) and row["torn"] > 0.0
     assert account.page_table([row]).count("\n") == 2
+
+
+def stretched(share: float, rate: float, steps: int = 800) -> tuple[Any, float, float]:
+    """Account of one point of melon that is torn, in float64: work done on it and stored in it."""
+    account = load_script("study/fracture_account")
+    melon = materials.get("fruit.watermelon")
+    row, _, alpha = rows_of(melon, torch.ones(1, dtype=torch.float64), 0.0125)
+    law, none = torch.tensor([1], dtype=torch.int32), torch.zeros(1, 6, dtype=torch.float64)
+    viscous = torch.zeros(1, 9, dtype=torch.float64)
+    viscous[0, 6:8] = torch.tensor([share, rate], dtype=torch.float64)
+    pull = torch.zeros(1, 3, 3, dtype=torch.float64)
+    pull[0, 0, 0] = 1.6 * abs(float(alpha[0])) / steps
+    where = torch.zeros(1, dtype=torch.int32)
+    volume = torch.ones(1, dtype=torch.float64)
+
+    def state(strain: Tensor, alpha: Tensor, viscous: Tensor, time: float) -> Any:
+        points = SimpleNamespace(
+            strain=strain, alpha=alpha, viscous=viscous, affine=pull, volume=volume, mass=volume,
+            material=where,
+        )  # fmt: skip
+        return SimpleNamespace(particles=points, time=time)
+
+    now = state(none, alpha, viscous, 0.0)
+    matter = SimpleNamespace(particles=now.particles, law=law, params=row)
+    meter = account.Account()
+    meter.begin(matter, now)
+    work, stress = 0.0, none
+    for step in range(steps):
+        p = now.particles
+        returned = ops.return_mapping(p.strain, p.alpha, pull, law=law, params=row, material=where)
+        work += float(stress[0, 0] * pull[0, 0, 0])
+        viscous, strain, alpha, stress = ops.viscous_step(
+            p.viscous, p.strain, p.alpha, pull, returned[:3], law=law, params=row,
+            material=where, dt=1.0,
+        )  # fmt: skip
+        now = state(strain, alpha, viscous, step + 1.0)
+        meter(now)
+    assert float(alpha[0]) >= 0.0
+    held = ops.elastic_energy(now.particles.strain, law=law, params=row, material=where)
+    stored = ops.viscous_energy(viscous, held, law=law, params=row, material=where)
+    return meter, work, float(stored)
+
+
+def test_the_account_of_a_torn_point_counts_what_its_spring_loses() -> None:
+    melon = materials.get("fruit.watermelon")
+    wanted = float(melon.fracture_energy or 0.0) / (BAND_CELLS * 0.0125)
+    plain, work, stored = stretched(0.0, 0.0)
+    assert float(plain.torn) == pytest.approx(wanted, rel=1e-2)
+    kept, *_ = stretched(0.75, 0.0)  # a spring that never relaxes is not there
+    assert float(kept.torn) == pytest.approx(float(plain.torn), rel=3e-3)
+    assert abs(float(kept.relaxed)) < 3e-3 * float(kept.torn)  # steps are explicit
+    slow, work, stored = stretched(0.75, 2e-3)
+    assert float(slow.torn) < float(plain.torn) and float(slow.relaxed) > 0.0
+    parts = float(slow.torn + slow.pressed + slow.relaxed)
+    assert parts == pytest.approx(work - stored, rel=1e-10)
+
+
+def test_what_a_point_takes_hangs_on_how_it_was_strained_before() -> None:
+    account = load_script("study/fracture_account")
+    row, _, alpha = rows_of(
+        materials.get("fruit.watermelon"), torch.ones(1, dtype=torch.float64), 0.0125
+    )
+    held = account.energy_of_path(row, alpha, account.OPENED, 400)
+    assert held == pytest.approx(softening_energy(row[0], float(alpha[0])), rel=1e-2)
+    pulled = account.energy_of_path(row, alpha, (1.0, -0.32, -0.32), 400)
+    sheared = account.energy_of_path(row, alpha, (1.0, -1.0, 0.0), 400)
+    assert held < 0.6 * pulled < 0.2 * sheared
+    with pytest.raises(ValueError, match="not broken"):
+        account.energy_of_path(row, alpha, (0.0, 0.0, 0.0), 10)
 
 
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:

@@ -36,11 +36,16 @@ def fracture_energy(length: float) -> float:
     return length * TENSILE**2 / YOUNG
 
 
-def stone(length: float) -> Material:
-    """A brittle material of which ``E G_c / s^2``, s its tensile strength, is a length [m]."""
+def stone(length: float, compressive: float = COMPRESSIVE) -> Material:
+    """A brittle material of which ``E G_c / s^2``, s its tensile strength, is a length [m].
+
+    Args:
+        length: [m].
+        compressive: Its strength in compression [Pa].
+    """
     return Material(
         "stone", young_modulus=YOUNG, poisson_ratio=POISSON, density=DENSITY, friction_angle=50.0,
-        tensile_strength=TENSILE, compressive_strength=COMPRESSIVE,
+        tensile_strength=TENSILE, compressive_strength=compressive,
         fracture_energy=fracture_energy(length), shear_damage=0.0,
     )  # fmt: skip
 
@@ -69,6 +74,7 @@ class Crack:
     energy: float
     tip: float
     band: float  # broken cells across it
+    beside: float = 0.0  # of the energy, what matter took that did not break
 
 
 def pull_apart(cells: int, *, length: float = 0.3, pull: float = 5e-4, shift: float = 0.0) -> Crack:
@@ -123,6 +129,7 @@ def open_slowly(
     angle: float = 0.0,
     jitter: float = 0.0,
     crossings: float = 18.0,
+    compressive: float = COMPRESSIVE,
 ) -> Crack:
     """Wedge the arms of a notched slab apart, so that a crack runs between them.
 
@@ -137,9 +144,11 @@ def open_slowly(
         angle: Of the slab to the rows of nodes [rad].
         jitter: Largest random displacement of a point in the plane [spacings].
         crossings: Duration in travel times of a pressure wave along the slab.
+        compressive: Strength in compression [Pa]. The yield ellipse through it and the tensile
+            strength is what matter around a tip holds, which is pulled along two axes.
     """
     dx, height, notch = 1.0 / cells, 0.375, 0.25
-    material = stone(length)
+    material = stone(length, compressive)
     points = sheet([0.0, 0.0], [1.0, height], dx)
     middle = points[:, 1] - 0.5 * height
     keep = (points[:, 0] > notch) | (middle.abs() > 1.01 * dx)
@@ -179,9 +188,10 @@ def open_slowly(
     passed = layer & (x > low) & (x < high)
     broken = layer & (world.peak >= 0.0).cpu()
     tip = float(x[broken].max()) if bool(broken.any()) else notch
-    energy = float(meter.of_points()[passed].sum()) / (dx * (high - low))
+    taken = meter.of_points().cpu() / (dx * (high - low) * fracture_energy(length))
     across = float((broken & passed).sum()) / 4.0 * dx / (high - low)
-    return Crack(energy / fracture_energy(length), tip, across)
+    beside = float(taken[passed & ~broken].sum())
+    return Crack(float(taken[passed].sum()), tip, across, beside)
 
 
 def bend(
