@@ -42,7 +42,7 @@ def point_push(
         sdf: Distance grids.
         position: [m], [N, 3].
         radius: Contact radius [m], [N].
-        mass: [kg], [N].
+        mass: What their volumes weigh at the density of their matter [kg], [N].
         wave: Speed of P-waves [m/s], [N].
         length: Cube root of the volume [m], [N].
         dx: Node spacing [m].
