@@ -128,9 +128,9 @@ class SolveSettings:
         choice("grid", "body"),
         "What elastic bodies turn with: the `grid` spreads each mass over a cell, so that a rod "
         "four cells thick twists 8 % too slowly; `body` shares the mass out among its points so "
-        "that the body has its own inertia (2 %). Not with `contact: points`.",
-        "body",
-        default="grid",
+        "that the body has its own inertia (2 %). Bodies that break or flow are left alone.",
+        "grid",
+        default="body",
     )
     devices: str = key(
         choice("one", "all"),

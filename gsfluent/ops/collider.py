@@ -27,7 +27,9 @@ MODES = {"sticky": 0, "slip": 1, "separate": 2}
 # Columns, as in csrc/core/collider/shape.h.
 TYPE, MODE, FRICTION, POINT, NORMAL, RADIUS, VELOCITY, RESTITUTION = 0, 1, 2, 3, 6, 9, 10, 13
 MASS, SWEEP, ORIENTATION, ANGULAR_VELOCITY, INERTIA, EXTENT, OFFSET = 14, 15, 16, 20, 23, 26, 29
-ONLY_CUT = 30
+ONLY_CUT, STIFFER = 30, 31
+STIFFEST = 3.0
+"""Largest ``stiffer``: with springs four times as stiff no step makes energy."""
 
 
 def collider_row(
@@ -48,6 +50,7 @@ def collider_row(
     sweep: bool = False,
     offset: int = 0,
     only_cut: int = 0,
+    stiffer: float = 0.0,
 ) -> Tensor:
     """One collider as a row.
 
@@ -75,6 +78,8 @@ def collider_row(
         offset: ``sdf``: index of the first value in the buffer, a multiple of 64.
         only_cut: 0, or bit number + 1 of ``cut``: acts only on fields that have this bit
             (:func:`gsfluent.ops.blade_sides`).
+        stiffer: In [0, 3]: where it pushes points, its springs are ``1 + stiffer`` times as stiff
+            as their matter. A slow press sinks in less by it; a body that lands bounces less.
 
     Returns:
         float64 [32]. Stack rows and cast them to the dtype of the grid for
@@ -93,7 +98,7 @@ def collider_row(
     row = torch.zeros(COLLIDER_COLUMNS, dtype=torch.float64)
     row[TYPE], row[MODE], row[FRICTION] = TYPES[kind], MODES[mode], friction
     row[RADIUS], row[RESTITUTION], row[MASS], row[SWEEP] = radius, restitution, mass, float(sweep)
-    row[OFFSET], row[ONLY_CUT] = offset // SDF_ALIGN, only_cut
+    row[OFFSET], row[ONLY_CUT], row[STIFFER] = offset // SDF_ALIGN, only_cut, stiffer
     for name, column, value, count in (
         ("point", POINT, point, 3),
         ("normal", NORMAL, normal, 3),
@@ -147,6 +152,7 @@ def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
     right &= (rows[:, ONLY_CUT] >= 0) & (rows[:, ONLY_CUT] <= 30)
     right &= (rows[:, FRICTION] >= 0) & (rows[:, MASS] >= 0) & (radius >= 0)
     right &= (rows[:, RESTITUTION] >= 0) & (rows[:, RESTITUTION] <= 1)
+    right &= (rows[:, STIFFER] >= 0) & (rows[:, STIFFER] <= STIFFEST)
     right &= (rows[:, INERTIA:OFFSET] >= 0).all(dim=1)
     right |= kind == -1
     right &= torch.isfinite(rows).all(dim=1)
@@ -158,7 +164,7 @@ def check_colliders(op: str, rows: Tensor, sdf_count: int) -> None:
             "mass), 1 (sphere: radius > 0), 2 (box: half edges > 0), 3 (capsule: radius > 0), "
             "4 (cylinder: radius and half length > 0), 5 (sdf: spacing > 0, its values inside the "
             "buffer), 6 (face: half edges > 0) or -1 (nothing), mode 0, 1, 2, friction >= 0, mass "
-            f"and inertia >= 0 and restitution in [0, 1], got {got}"
+            f"and inertia >= 0, restitution in [0, 1] and stiffer in [0, 3], got {got}"
         )
 
 

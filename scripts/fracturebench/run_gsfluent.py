@@ -46,7 +46,7 @@ def question(name: str, args: argparse.Namespace) -> Question:
         raise SceneError(f"{name}: not what was frozen: {drift[0]}")
     return Question(
         name, frozen.PER_CELL, scene.digest(), args.device, args.dtype, args.cfl, args.place,
-        not args.one_field, args.method, args.repeat, args.law,
+        not args.one_field, args.method, args.repeat, args.law, args.contact,
     )  # fmt: skip
 
 
@@ -91,6 +91,10 @@ def main() -> int:
     parser.add_argument(
         "--law", choices=("nacc", "phase_field"), default="nacc", help="of what breaks"
     )
+    parser.add_argument(
+        "--contact", choices=("nodes", "points"), default="nodes",
+        help="what separating colliders and other bodies push",
+    )  # fmt: skip
     parser.add_argument("--method", default="", help="name in the table")
     parser.add_argument("--repeat", type=int, default=3, help="timed runs")
     parser.add_argument("--jobs", type=int, default=1, help="cases at a time")
@@ -99,7 +103,8 @@ def main() -> int:
     args = parser.parse_args()
     if args.quick:
         args.repeat = 1
-    args.method = args.method or METHODS[args.law]
+    pushed = " points" if args.contact == "points" else ""
+    args.method = args.method or METHODS[args.law] + pushed
     bad = 0
     try:
         kind = None if args.law == "nacc" else "fracture"
@@ -114,8 +119,11 @@ def main() -> int:
             path = folder / f"{name}.npz"
             if path.is_file():
                 was = Run.load(path)
-                now = {"dtype": args.dtype, "cfl": args.cfl, "place": args.place, "law": args.law}
-                had = {"place": 0.0, "law": "nacc", **was.settings}
+                now = {
+                    "dtype": args.dtype, "cfl": args.cfl, "place": args.place, "law": args.law,
+                    "contact": args.contact,
+                }  # fmt: skip
+                had = {"place": 0.0, "law": "nacc", "contact": "nodes", **was.settings}
                 if was.device != args.device or any(had.get(k) != now[k] for k in now):
                     raise SceneError(
                         f"{path} was computed on {was.device} with {dict(was.settings)}: give "

@@ -398,6 +398,16 @@ def test_gsfluent_converges_to_the_exact_motion(name: str, at_least: float) -> N
     assert math.log(errors[0] / errors[1]) / math.log(ratio) > at_least
 
 
+def test_points_that_push_give_more_of_an_impact_back_than_nodes() -> None:
+    case = find("collide")
+    scene = case.build(case.ladder[0], 8)
+    runs = [run_case(scene, contact=contact) for contact in ("nodes", "points")]
+    nodes, points = (judge(scene, run) for run in runs)
+    assert points[0].error < 0.6 * nodes[0].error  # momentum through the impact
+    assert points[1].error < 0.6 * nodes[1].error and points[3].passed  # restitution, momentum
+    assert "contact" not in runs[0].settings and runs[1].settings["contact"] == "points"
+
+
 def test_too_few_points_for_a_figure_are_no_number_and_no_error() -> None:
     scene = find("two_material_bar").build(0.02, 1)  # one layer beside the joint
     still = np.broadcast_to(scene.x, (len(scene.times), *scene.x.shape)).copy()

@@ -13,7 +13,6 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.ops.plasticity import LAWS
 from gsfluent.pipeline.matter.points import build_matter, sample_points
-from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.scene.scene import Scene
 
 
@@ -163,8 +162,6 @@ def test_a_body_that_lasts_may_have_its_own_inertia():
             )
         else:
             assert torch.equal(a, b)
-    with pytest.raises(InputError, match="inertia does not go with surface"):
-        SolverOptions(inertia=True, surface=True)
 
 
 def test_sampling_follows_the_frame_and_the_seed():

@@ -9,7 +9,7 @@ import torch
 
 from gsfluent import ops
 from gsfluent.errors import InputError
-from gsfluent.lab.problems.contact import floor
+from gsfluent.lab.problems.contact import edges, floor
 from gsfluent.lab.problems.contact.contact import SPACING, bodies
 from gsfluent.lab.world.driver import World, running_on
 from gsfluent.lab.world.registry import Result
@@ -56,7 +56,7 @@ def test_sliding_is_coulombs(friction: float, device: str) -> None:
 def _sliding(engine: str, dtype: torch.dtype = torch.float64) -> World:
     points = box((0.13, 0.27, 0.1), (3.0, 3.0, 3.0), SPACING)
     push = torch.tensor([0.05, 0.02, -0.05], dtype=torch.float64)
-    floors = [wall(2, 0.0, mode="separate", friction=0.4, velocity=(0.0, 0.03, 0.01))]
+    floors = [wall(2, 0.0, mode="separate", friction=0.4, velocity=(0.0, 0.03, 0.01), stiffer=1.5)]
     world = bodies(
         [points], [push], colliders=floors, surface=0.5, engine=engine, dtype=dtype, dt=0.3,
         gravity=(0.0, 0.0, -0.002),
@@ -125,6 +125,22 @@ def test_other_shapes_push_points_too(row: torch.Tensor, device: str) -> None:
     assert world.kinetic() + world.elastic() <= start * (1.0 + 1e-9)
     given = float(world.impulse[0, 2]) / mass
     assert given == pytest.approx(0.05 + float(world.momentum()[2]) / mass, rel=1e-7)
+
+
+def test_stiffer_plates_sink_in_less() -> None:
+    soft, stiff = (edges.pressed(4, 0.24, stiffer=s) for s in (0.0, 3.0))
+    assert 0.0 < stiff < 0.4 * soft
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.4])
+def test_landing_on_a_stiffer_floor_makes_no_energy(speed: float) -> None:
+    points = box((0.13, 0.27, 0.4), (4.0, 3.0, 4.0), SPACING)
+    world = bodies(
+        [points], [torch.tensor([0.01, 0.0, -speed], dtype=torch.float64)],
+        colliders=[wall(2, mode="separate", stiffer=3.0)], surface=0.5,
+    )  # fmt: skip
+    assert floor.largest_energy(world, 40.0) <= 1.0 + 1e-6
+    assert float(world.momentum()[2]) > 0.0
 
 
 def test_a_point_that_starts_inside_by_its_radius_is_not_pushed() -> None:

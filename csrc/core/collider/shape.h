@@ -25,7 +25,8 @@ enum ColliderColumn {
   kExtent = 26,           // box: half edges; capsule, cylinder: half length in z (third) [m];
                           // distance grid: number of values along x, y, z
   kSdfStart = 29,         // distance grid: its first value in the buffer, in units of 64 values
-  kOnlyCut = 30           // 0: acts on all matter; n > 0: only on fields whose `cut` has bit n - 1
+  kOnlyCut = 30,          // 0: acts on all matter; n > 0: only on fields whose `cut` has bit n - 1
+  kStiffer = 31           // springs that push points are 1 + this times as stiff as their matter
 };
 constexpr int kColliderColumns = 32;
 constexpr int64_t kSdfAlign = 64;  // so that offsets are exact in float32 up to 2^30
@@ -152,6 +153,7 @@ GSF_HOST_DEVICE bool collider_valid(const T* row, int64_t sdf_count) {
   if (!(mode == T(0) || mode == T(1) || mode == T(2))) return false;
   if (!(row[kFriction] >= T(0) && row[kMass] >= T(0) && row[kRadius] >= T(0))) return false;
   if (!(row[kRestitution] >= T(0) && row[kRestitution] <= T(1))) return false;
+  if (!(row[kStiffer] >= T(0) && row[kStiffer] <= T(3))) return false;
   for (int i = 0; i < 3; ++i)
     if (!(row[kInertia + i] >= T(0) && row[kExtent + i] >= T(0))) return false;
   const T *e = row + kExtent, r = row[kRadius];

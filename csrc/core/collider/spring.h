@@ -33,11 +33,12 @@ GSF_HOST_DEVICE bool collider_springs(const T* row) {
 
 // Speed [m/s] that a point gets along the normal in a step: `depth` [m] is how far it is nearer
 // than its radius, `wave` the speed of its P-wave, `length` the cube root of its volume, `longest`
-// a step [s] that no step exceeds.
+// a step [s] that no step exceeds, `times` what the collider is stiffer: a slow press sinks in that
+// much less, and a blow leaves more that the transfer takes.
 template <typename T>
-GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt, T longest) {
+GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt, T longest, T times) {
   const T rate = min(wave * wave / (dx * length), T(kSpringStep) / (longest * longest));
-  return dt * rate * min(depth, T(kSpringDepth) * dx);
+  return dt * times * rate * min(depth, T(kSpringDepth) * dx);
 }
 
 // Time [s] by which a spring's force is ahead of its depth: what it gives back less than it took.

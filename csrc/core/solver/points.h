@@ -18,6 +18,14 @@ GSF_HOST_DEVICE double row_wave(const SolverView<T>& s, int64_t row) {
          (kSlowUnloading * double(s.dx));
 }
 
+// Volume of the points of a row [m^3], and the mass that it has at its matter's density [kg]: what
+// a point is pushed with hangs on the room that it takes, not on its share of the body's mass.
+template <typename T>
+GSF_HOST_DEVICE double row_volume(const SolverView<T>& s, int64_t row) {
+  const double dx = double(s.dx);
+  return 0.25 * dx * dx * double(s.rows[row * kRowColumns + kStressColumn]);
+}
+
 // Step [s] that springs of points must bear: the longest at rest, `wave` being the fastest of the
 // rows. Not the present one: a spring that is stiffer in a short step gives back more than it took.
 GSF_HOST_DEVICE double spring_step(const SolverClock& c, double wave, double dx) {
@@ -63,15 +71,15 @@ GSF_HOST_DEVICE bool push_point(const SolverView<T>& s, int64_t k, const PushedP
   Vec3<double> normal;
   double depth = p.radius - collider_signed_distance(row, s.sdf, p.x, normal);
   if (!(depth > 0.0)) return false;
-  const T* r = s.rows + p.row * kRowColumns;
-  const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
-  const double wave = row_wave(s, p.row);
+  const double volume = row_volume(s, p.row), wave = row_wave(s, p.row);
+  const double mass = volume / double(s.rows[p.row * kRowColumns + kInverseDensityColumn]);
   const Vec3<double> own = collider_velocity(row, p.x);
   double away = 0.0;
   for (int axis = 0; axis < 3; ++axis)
     away += normal[axis] * (double(p.velocity[axis]) - own[axis]);
   depth = max(0.0, depth - spring_lag(wave, dx) * away);
-  const double gained = spring_speed(depth, wave, cbrt(mass * thin), dx, dt, longest);
+  const double gained =
+      spring_speed(depth, wave, cbrt(volume), dx, dt, longest, 1.0 + row[kStiffer]);
   for (int axis = 0; axis < 3; ++axis) out[axis] += T(mass * gained * normal[axis]);
   out[3] += T(row[kFriction] * mass * gained);
   return true;
@@ -85,11 +93,10 @@ struct TouchMatter {
 template <typename T>
 GSF_HOST_DEVICE TouchMatter touch_matter(const SolverView<T>& s, int64_t row, double longest) {
   using std::cbrt;
-  const T* r = s.rows + row * kRowColumns;
-  const double mass = double(r[kMassColumn]), thin = double(r[kInverseDensityColumn]);
-  const double dx = double(s.dx);
-  return {mass * thin / (dx * dx * dx),
-          touch_stiffness(1.0 / thin, row_wave(s, row), cbrt(mass * thin), dx, longest)};
+  const double dx = double(s.dx), volume = row_volume(s, row);
+  const double density = 1.0 / double(s.rows[row * kRowColumns + kInverseDensityColumn]);
+  return {volume / (dx * dx * dx),
+          touch_stiffness(density, row_wave(s, row), cbrt(volume), dx, longest)};
 }
 
 // Sums over the points of other objects near one.

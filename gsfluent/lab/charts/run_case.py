@@ -232,6 +232,7 @@ class Question:
     method: str  # name in the table
     repeat: int  # timed runs
     law: str = "nacc"  # of what breaks
+    contact: str = "nodes"  # what colliders and other bodies push
 
 
 def answer_task(question: Question, folder: Path) -> None:
@@ -247,6 +248,7 @@ def answer_task(question: Question, folder: Path) -> None:
     options: dict[str, Any] = {
         "device": question.device, "dtype": getattr(torch, question.dtype), "cfl": question.cfl,
         "fields": question.fields, "place": question.place, "law": question.law,
+        "contact": question.contact,
     }  # fmt: skip
     run = run_case(scene, method=question.method, **options)
     wall = run.wall_seconds

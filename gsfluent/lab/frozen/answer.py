@@ -141,6 +141,7 @@ def run_case(
     place: float = 0.0,
     method: str = "gsfluent",
     law: str = "nacc",
+    contact: str = "nodes",
     watch: Callable[[World, int], None] | None = None,
     setup: Callable[[World], None] | None = None,
     **options: Any,
@@ -159,6 +160,7 @@ def run_case(
             collider looks along: a wall has to stay on its nodes. What is handed in does not move.
         method: Name in the record.
         law: Of what breaks, ``nacc`` or ``phase_field``.
+        contact: What separating colliders and other bodies push: ``nodes`` or ``points``.
         watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         setup: ``setup(world)`` is called once before the first step; it may wrap ``world.force``.
         **options: Further arguments of World (``k``, ``epsilon``, ``implicit``, ...).
@@ -173,6 +175,8 @@ def run_case(
     several = fields and int(scene.body.max()) > 0
     drives = Drives(scene, dtype, device) if scene.drives else None
     shift = _shift(scene, place)
+    if contact == "points":
+        options |= {"surface": 0.5, "touch": several}
     world = World(
         torch.from_numpy(scene.x + shift), torch.from_numpy(scene.v),
         volume=torch.from_numpy(scene.volume), dx=scene.dx, law=laws, params=params,
@@ -212,7 +216,8 @@ def run_case(
     settings = {
         "dx": scene.dx, "cfl": cfl, "dt": dt, "dtype": str(dtype).removeprefix("torch."),
         "engine": world.engine, "fields": several, **({"place": place} if place else {}),
-        **({} if law == "nacc" else {"law": law}), **options,
+        **({} if law == "nacc" else {"law": law}),
+        **({} if contact == "nodes" else {"contact": contact}), **options,
     }  # fmt: skip
     return Run(
         scene.name, method, scene.times, x, v, wall, world.steps, settings, str(device), failed,

@@ -129,8 +129,8 @@ class Pushed:
                     row[20:23].expand_as(position), position - row[3:6]
                 )
                 impulse = spring.point_push(
-                    row, None, position, scene.radius, scene.mass, wave, length, scene.dx, dt,
-                    velocity - own, longest,
+                    row, None, position, scene.radius, params[:, 6] * scene.volume, wave, length,
+                    scene.dx, dt, velocity - own, longest,
                 )  # fmt: skip
             summed, _ = ops.p2g(
                 position, impulse / scene.mass[:, None], none, scene.mass, dx=scene.dx,

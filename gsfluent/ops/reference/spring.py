@@ -42,7 +42,7 @@ def point_push(
         sdf: Distance grids.
         position: [m], [N, 3].
         radius: Contact radius [m], [N].
-        mass: [kg], [N].
+        mass: What their volumes weigh at the density of their matter [kg], [N].
         wave: Speed of P-waves [m/s], [N].
         length: Cube root of the volume [m], [N].
         dx: Node spacing [m].
@@ -55,7 +55,7 @@ def point_push(
     ahead = deep - DAMPING * dx / wave * (velocity * normal).sum(-1)
     depth = torch.where(deep > 0, ahead, 0.0).clamp(0.0, DEPTH * dx)
     rate = (wave**2 / (dx * length)).clamp(max=STEP / longest**2)
-    return (mass * dt * rate * depth)[:, None] * normal
+    return (mass * dt * (1.0 + row[31]) * rate * depth)[:, None] * normal
 
 
 def node_friction(

@@ -80,6 +80,7 @@ class RigidSet:
                     point=(0.0, 0.0, scene.floor),
                     mode=scene.floor_mode,
                     friction=scene.floor_friction,
+                    stiffer=columns.STIFFEST if any(c.backed for c in scene.colliders) else 0.0,
                 )
             )
             self.names.append("floor")
@@ -402,6 +403,7 @@ class RigidSet:
             mass=mass,
             inertia=[mass / volume * moment for moment in inertia] if mass else (0.0, 0.0, 0.0),
             sweep=mass > 0.0,
+            stiffer=columns.STIFFEST if c.backed else 0.0,
             **shape,
         )
 

@@ -106,8 +106,7 @@ class SolverOptions:
             and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver
             only; the composed operators hold nodes.
         inertia: Share out the mass of elastic bodies so that thin ones turn and twist as fast as
-            they should (:func:`gsfluent.ops.inertial_shares`). Points near surfaces are lighter, so
-            not together with ``surface``, which pushes each by its mass.
+            they should (:func:`gsfluent.ops.inertial_shares`). Points near surfaces are lighter.
         all_devices: Step scenes of many points on all GPUs of this machine, with the bits of one
             (docs/theory/ranks.md); the resident solver on a GPU only.
         return_map: Options of :func:`gsfluent.ops.return_mapping` (``k``, ``epsilon``,
@@ -130,7 +129,7 @@ class SolverOptions:
     deterministic: bool = False
     standing: bool = False
     surface: bool = False
-    inertia: bool = False
+    inertia: bool = True
     all_devices: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
     max_rollbacks: int = 6
@@ -147,11 +146,6 @@ class SolverOptions:
             raise InputError(
                 f"simulate: cfl must be at most {CFL_MOST:g} with surface=True, got {self.cfl:g}",
                 hint="longer steps make energy where points are pushed",
-            )
-        if self.surface and self.inertia:
-            raise InputError(
-                "simulate: inertia does not go with surface: light points would sink in deeper",
-                hint="let colliders hold nodes (contact: nodes), or leave out inertia",
             )
 
 

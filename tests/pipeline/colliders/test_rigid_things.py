@@ -125,6 +125,15 @@ def test_a_plate_moves_between_its_times_only() -> None:
     assert rigid.next_change(0.3) == math.inf
 
 
+def test_a_press_and_its_floor_are_stiffer_than_what_bodies_land_on() -> None:
+    scene = Scene()
+    scene.add(ellipsoid(), SOFT)
+    scene.add_collider("sphere", at=(0.0, 0.0, 2.0), radius=0.1)
+    assert RigidSet(scene, DX).start[:, 31].tolist() == [0.0, 0.0]
+    scene.press(speed=0.5, stroke=0.05)
+    assert RigidSet(scene, DX).start[:, 31].tolist() == [3.0, 0.0, 3.0]
+
+
 def test_a_free_ball_passes_its_point_at_its_time_and_stops_at_the_floor() -> None:
     scene = Scene()
     scene.add(ellipsoid(), SOFT)

@@ -15,6 +15,7 @@ from gsfluent.lab.problems.contact.floor import HALF
 from gsfluent.lab.world.registry import Result, compare, problem
 from gsfluent.lab.world.shapes import box
 from gsfluent.lab.world.walls import wall
+from gsfluent.ops.collider import STIFFEST
 
 
 def cubes(cells: int, *, touch: bool = True, speed: float = 0.05) -> tuple[float, float]:
@@ -46,18 +47,19 @@ def cubes(cells: int, *, touch: bool = True, speed: float = 0.05) -> tuple[float
     return now, most
 
 
-def pressed(cells: int, share: float, *, touch: bool = True) -> float:
+def pressed(cells: int, share: float, *, touch: bool = True, stiffer: float = STIFFEST) -> float:
     """Press a cube slowly between two plates; how far each has sunk into it [dx].
 
     Args:
         cells: Edge of the cube [dx].
         share: Of its height that the plates come nearer.
         touch: Whether plates push points; else they hold nodes.
+        stiffer: What the springs of the plates are stiffer than matter; default: as of a press.
     """
     way, speed = share * cells, 0.02
     rows = [
-        wall(2, 0.37, mode="separate"),
-        wall(2, 0.37 + cells, -1, mode="separate", velocity=[0.0, 0.0, -speed]),
+        wall(2, 0.37, mode="separate", stiffer=stiffer),
+        wall(2, 0.37 + cells, -1, mode="separate", velocity=[0.0, 0.0, -speed], stiffer=stiffer),
     ]
     world = bodies(
         [box((0.13, 0.27, 0.37), (cells,) * 3, SPACING)], [torch.zeros(3, dtype=torch.float64)],
@@ -100,5 +102,6 @@ def pressed_cube() -> Iterator[Result]:
         yield compare(
             f"each plate in a cube of {cells} cells, pressed by {share:.0%}",
             pressed(cells, share), tolerance=0.1, unit="dx", source="touching",
-            note=f"plates hold nodes: {pressed(cells, share, touch=False):.3f} dx",
+            note=f"plates hold nodes: {pressed(cells, share, touch=False):.3f} dx; springs as "
+            f"stiff as the matter: {pressed(cells, share, stiffer=0.0):.3f} dx",
         )  # fmt: skip
