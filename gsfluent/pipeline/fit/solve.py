@@ -31,6 +31,8 @@ CLOSE = 2e-4
 """A step this short, in free coordinates, ends a stage."""
 SETTLED = 1e-3
 """A step that lowers the cost by less than this part of it ends a stage."""
+ENOUGH = 0.5
+"""So little [nats] is no news: it ends a search whose numbers are not the last."""
 UNSURE = 0.25
 """Of what a finer grid changes in a frame, the part that is not believed."""
 TELLING, QUIET = 30, 0.05
@@ -223,6 +225,7 @@ def search(
     *,
     active: NDArray[np.bool_] | None = None,
     rounds: int = 12,
+    enough: float = 0.0,
     tell: Tell | None = None,
 ) -> Fitted:
     """Search from a start on the first frames.
@@ -233,6 +236,7 @@ def search(
         frames: How many frames count.
         active: Coordinates that may change; all when None.
         rounds: Most linearisations.
+        enough: A step that lowers the cost by less than this ends it, too.
         tell: Told of each.
 
     Raises:
@@ -269,7 +273,7 @@ def search(
             except TooFast:
                 there = np.inf
             if there < here:
-                little = here - there < SETTLED * here
+                little = here - there < max(SETTLED * here, enough)
                 free, moved, better = trial, float(np.abs(step).max()), True
                 damping = max(damping / DAMPING[1], 1e-8)
                 break
@@ -446,7 +450,8 @@ def in_stages(
     moving = problem.unknowns.motion_only()
     before = contact_frame(problem, free)
     if moving.any() and before >= 3:
-        free = search(problem, free, before, active=moving, rounds=6, tell=tell).free
+        free = search(problem, free, before, active=moving, rounds=6, enough=ENOUGH,
+                      tell=tell).free  # fmt: skip
     runs = problem.forward.runs
     found = None
     counts = sorted({max(2, round(share * frames)) for share in shares})
@@ -457,7 +462,8 @@ def in_stages(
                 problem.refine(finer, free, count)
             if weigh and number and found is not None:
                 problem.reweigh(found.per_frame, found.count)
-            found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
+            found = search(problem, free, count, rounds=12 if last else 5,
+                           enough=0.0 if last and weigh else ENOUGH, tell=tell)  # fmt: skip
             moved, free = float(np.abs(found.free - free).max()), found.free
             if (number or not weigh) and moved < 10.0 * CLOSE:
                 break

@@ -68,7 +68,8 @@ def run_task(task: Task) -> dict[str, Any]:
     problem = Problem(forward, observer, task.unknowns, task.target.step)
     try:
         found = in_stages(problem, np.asarray(task.start), finer=finer, shares=task.shares,
-                         settle=task.judge or task.shares[-1] == 1.0)  # fmt: skip
+                         settle=task.judge or task.shares[-1] == 1.0,
+                         weigh=not task.judge)  # fmt: skip
     except TooFast:
         return {"cost": float("inf"), "free": list(task.start), "runs": forward.runs}
     judged = judge(problem, found.free, task.shares[-1], finer) if task.judge else {}
