@@ -119,6 +119,10 @@ class Problem:
         self.trust = np.ones(len(forward.times))
         self._last: tuple[Any, Motion] | None = None
 
+    def forget(self) -> None:
+        """Keep no run: the same coordinates move otherwise from now on."""
+        self._last = None
+
     def motion(self, free: Array, frames: int, dt: float, *, keep: bool = False) -> Motion:
         """Run these coordinates; of a run that is kept only what the grid changes is done anew."""
         return self.motions([free], frames, dt, keep=keep)[0]
