@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import FINER, Unknowns
+from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.targets.target import Followers, Motion, Observer
 
 Array = NDArray[np.float64]
@@ -39,6 +40,8 @@ TELLING, QUIET = 30, 0.05
 """Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
 CORRECTIONS = 4
 """How often at most the change by a finer grid is seen anew, on all frames."""
+NEAR = (0.8, 1.02)
+"""Of the step that numbers could take, the steps that are not worth a change."""
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Of the frames, stage by stage."""
 
@@ -118,6 +121,7 @@ class Problem:
         self.change: Motion | None = None
         self.trust = np.ones(len(forward.times))
         self._last: tuple[Any, Motion] | None = None
+        self._dt: float | None = None
 
     def forget(self) -> None:
         """Keep no run: the same coordinates move otherwise from now on."""
@@ -202,8 +206,14 @@ class Problem:
                 self.trust[k] = 1.0 / max(size, QUIET)
 
     def dt(self, free: Array) -> float:
-        """A time step for a linearisation about them."""
-        return self.forward.step(self.fixed | self.unknowns.values(free))
+        """A time step for a linearisation about them: the last one as long as it is near.
+
+        Then a step of the search that was taken is the middle of the next linearisation.
+        """
+        wanted = self.forward.step(self.fixed | self.unknowns.values(free))
+        if self._dt is None or not NEAR[0] * wanted <= self._dt <= NEAR[1] * wanted:
+            self._dt = wanted
+        return self._dt
 
     def seen(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
         """Residuals and their frames."""
@@ -270,7 +280,7 @@ def search(
             trial = free.copy()
             trial[rows] += step
             try:
-                moved_to = problem.motion(trial, frames, at.dt)
+                moved_to = problem.motion(trial, frames, at.dt, keep=True)
                 found = problem.seen(moved_to, frames, at.pairs)[0] / scale
                 there = cost_of(found)
                 there += 0.5 * float((prior * (trial - unknowns.start) ** 2).sum())

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import FINER, OFFSET, Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, in_stages, run_at
+from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.scene.scene import Scene
 from gsfluent.targets.target import Target
 
