@@ -178,8 +178,8 @@ def _first(motion: Motion, frames: int) -> Motion:
 class _Lockstep:
     """Searches that wait until all of them want something."""
 
-    def __init__(self, count: int) -> None:
-        self.turn, self.active, self.waiting = Condition(), count, list[_Wish]()
+    def __init__(self) -> None:
+        self.turn, self.active, self.waiting = Condition(), 0, list[_Wish]()
 
     def ask(self, setup: Setup, lanes: Sequence[Lane]) -> list[Motion]:
         """Wait for the others, and get what was asked for.
@@ -197,6 +197,11 @@ class _Lockstep:
             assert wish.error is not None
             raise wish.error
         return wish.found
+
+    def enter(self, count: int) -> None:
+        """Wait for so many more."""
+        with self.turn:
+            self.active += count
 
     def leave(self) -> None:
         """Wait no longer for one of them."""
@@ -273,25 +278,32 @@ def together(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
     """Call a function for every item, each in a thread; their runs of the solver go side by side.
 
     Args:
-        function: A search, or what does some of them.
+        function: A search, or what does some of them, also by this function.
         items: What it is called with.
 
     Returns:
         What it returns, in the order of the items.
     """
     every, found = list(items), []
+    others = _LOCKSTEP.get()
+    lockstep = others or _Lockstep()
+
+    def one(item: Any) -> Any:
+        _LOCKSTEP.set(lockstep)  # of this thread, which ends with its items
+        try:
+            return function(item)
+        finally:
+            lockstep.leave()
+
     for first in range(0, len(every), MOST_SEARCHES):
         some = every[first : first + MOST_SEARCHES]
-        lockstep = _Lockstep(len(some))
-
-        def one(item: Any, lockstep: _Lockstep = lockstep) -> Any:
-            token = _LOCKSTEP.set(lockstep)
-            try:
-                return function(item)
-            finally:
-                _LOCKSTEP.reset(token)
-                lockstep.leave()
-
-        with ThreadPoolExecutor(len(some)) as pool:
-            found += [call.result() for call in [pool.submit(one, item) for item in some]]
+        lockstep.enter(len(some))
+        if others is not None:  # this thread wants nothing until they are done
+            others.leave()
+        try:
+            with ThreadPoolExecutor(len(some)) as pool:
+                found += [call.result() for call in [pool.submit(one, item) for item in some]]
+        finally:
+            if others is not None:
+                others.enter(1)
     return found

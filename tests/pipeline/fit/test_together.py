@@ -103,3 +103,26 @@ def test_fits_side_by_side_find_their_numbers() -> None:
 
     found = together(fit, [6e4, 2e5])
     assert found == pytest.approx([6e4, 2e5], rel=1e-2)
+
+
+def test_searches_within_searches_wait_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two scenes, two runs of each: four lanes of one run, then two."""
+    calls: list[int] = []
+
+    def counted(setup: Any, lanes: Any) -> Any:
+        calls.append(len(lanes))
+        return solve(setup, lanes)
+
+    monkeypatch.setattr(rooms, "solve", counted)
+
+    def inner(young: float) -> float:
+        return float(Forward(scene(elastic(young)), TIMES[:3], DX).run({}, 3, 1e-3).strain)
+
+    def outer(young: float) -> list[float]:
+        both = together(inner, [young, 2.0 * young])
+        return [*both, inner(young)]
+
+    found = together(outer, [5e4, 1e5])
+    assert sorted(calls, reverse=True)[0] == 4 and sum(calls) == 6
+    assert found[0][1] == pytest.approx(found[1][0], rel=1e-6)
+    assert found[0][2] == pytest.approx(found[0][0], rel=1e-6)
