@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.materials import LAWS, Material
-from gsfluent.ops import SolverError
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.fit.parameters import OFFSET, VECTORS
+from gsfluent.pipeline.fit.together import MOST_POINTS, Lane, Setup, agreed, moved
 from gsfluent.pipeline.matter.points import (
     POINTS_PER_CELL,
     body_frame,
@@ -34,9 +33,6 @@ from gsfluent.targets.target import Motion, Setting
 CFL = 0.4
 HASTE = 1.3
 """Margin of the time step for waves that matter under pressure carries faster."""
-MOST_STEPS = 200_000
-MOST_POINTS = 1_000_000
-"""Of runs that are done as one on a GPU."""
 
 
 class Matter(NamedTuple):
@@ -59,17 +55,6 @@ class Matter(NamedTuple):
     mass: Tensor
     volume: Tensor
     copies: int
-
-
-class TooFast(Exception):
-    """The time step was too long for what these numbers do."""
-
-
-def _motion(shown: Sequence[tuple[Tensor, ...]]) -> Motion:
-    """What was shown frame by frame."""
-    where, maps, pushes = (torch.stack(part) for part in zip(*shown, strict=True))
-    change = maps.mT @ maps - torch.eye(3, dtype=torch.float64)  # twice Green's strain
-    return Motion(where, maps, pushes, 0.5 * change.abs().amax())
 
 
 class Forward:
@@ -211,75 +196,39 @@ class Forward:
             TooFast: The step was too long for one of them.
         """
         self.runs += len(sets)
-        made = [self._placed(values, dt, k) for k, values in enumerate(sets)]
-        parts = [dict(one) for one, _, _ in made]
-        shifts = [shift for _, shift, _ in made]
-        size, more = made[0][2].copies * self.count, 0
-        for part in parts:
-            part["material"] = part["material"] + more
-            more += len(part["law"])
-        whole = {name: torch.cat([part[name] for part in parts]).to(self.device)
-                 for name in parts[0]}  # fmt: skip
-        body = self._fields()
-        if body is not None:
-            each = body.repeat(made[0][2].copies)
-            body = torch.cat([each + k * len(self.ranges) for k in range(len(sets))])
-        rows, there = self.rigid.start, self.device
-        solver = ops.Solver(
-            dx=self.dx, body=None if body is None else body.to(there), gravity=self.scene.gravity,
-            colliders=rows.to(there) if rows.shape[0] else None,
-            sdf=None if self.rigid.sdf is None else self.rigid.sdf.to(there),
-            friction=self.scene.friction, dt=dt, **whole,
+        dt = agreed(dt)
+        setup = Setup(
+            self.dx, dt, tuple(self.times[:frames]), self.scene.gravity, self.scene.friction,
+            self.rigid.start, self.rigid.sdf, self.device,
         )  # fmt: skip
-        shown: list[list[tuple[Tensor, ...]]] = [[] for _ in sets]
-        now, steps = 0.0, 0
-        for time in self.times[:frames]:
-            span = time - now
-            if span > 0.0:
-                count = max(1, math.ceil(span / dt - 1e-9))
-                steps += count
-                if steps > MOST_STEPS:
-                    raise TooFast
-                solver._write(dt_fixed=span / count)
-                try:
-                    solver.advance(steps=count)
-                except (SolverError, ValueError) as error:
-                    raise TooFast from error
-                now = time
-            place, map = solver.position.double().cpu(), solver.deformation
-            assert map is not None  # tracked from the start
-            if not bool(torch.isfinite(place).all()):
-                raise TooFast
-            map = map.double().cpu()
-            impulse = solver.impulse.cpu() if rows.shape[0] else place.new_zeros(0, 3)
-            for k, shift in enumerate(shifts):
-                own = slice(k * size, k * size + self.count)
-                shown[k].append((place[own] - shift, map[own].clone(), impulse))
-        return [_motion(one) for one in shown]
+        shifts = [self.rest.new_tensor([0.0, 0.0, float(v.get(OFFSET, 0.0)) * self.dx])
+                  for v in sets]  # fmt: skip
+        lanes = [self._lane(v, dt, shift) for v, shift in zip(sets, shifts, strict=True)]
+        made = moved(setup, lanes, alone=bool(self.scene.colliders))
+        return [m._replace(position=m.position - s) for m, s in zip(made, shifts, strict=True)]
 
-    def _placed(
-        self, values: Mapping[str, Any], dt: float, number: int
-    ) -> tuple[dict[str, Tensor], Tensor, Matter]:
-        """Points with these numbers as the solver takes them, and how far off they are laid."""
+    def _lane(self, values: Mapping[str, Any], dt: float, shift: Tensor) -> Lane:
+        """Points with these numbers as the solver takes them."""
         matter = self._matter(values)
         copies = matter.copies
         position, velocity, affine = self.start(values)
-        shift = position.new_tensor([0.0, 0.0, float(values.get(OFFSET, 0.0)) * self.dx])
-        shift[0] += number * self._apart()
         # a step of the solver kicks first, then drifts: half a kick less makes it second order
         first = next((t for t in self.times if t > 0.0), dt)
         kick = 0.5 * first / max(1, math.ceil(first / dt - 1e-9))
         velocity = velocity - kick * velocity.new_tensor(self.scene.gravity)
         eye = torch.eye(3, dtype=torch.float64)
-        return {
+        fields = {
             "position": (position + shift).repeat(copies, 1),
             "velocity": velocity.repeat(copies, 1), "mass": matter.mass, "volume": matter.volume,
             "law": matter.law, "params": matter.params, "material": matter.material,
             "alpha": matter.alpha[matter.material.long()], "affine": affine.repeat(copies, 1, 1),
             "deformation": eye.repeat(copies * self.count, 1, 1),
-        }, shift, matter  # fmt: skip
+        }  # fmt: skip
+        body = self._fields()
+        body = None if body is None else body.repeat(copies)
+        return Lane(fields, body, self.count, self._reach())
 
-    def _apart(self) -> float:
+    def _reach(self) -> float:
         """A whole number of blocks [m] that bodies side by side never cross."""
         span = self.rest.amax(dim=0) - self.rest.amin(dim=0)
         speed = float(self._velocity.norm(dim=1).max()) + 5.0

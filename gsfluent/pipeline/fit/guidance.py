@@ -19,9 +19,10 @@ from gsfluent.data import Camera
 from gsfluent.draw import draw_at
 from gsfluent.errors import InputError, RunError
 from gsfluent.pipeline.carrying import carried
-from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Unknowns, read_learn
 from gsfluent.pipeline.fit.stage import Found, with_values
+from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.render.camera import Action, look_at
 from gsfluent.pipeline.stage import Stage

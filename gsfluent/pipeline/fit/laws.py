@@ -210,23 +210,29 @@ def choose_laws(
     taken = {n: m.law if m.law in NUMBERS else laws[0] for n, m in places(scene).items()}
     values: dict[str, Any] = {}
     report: dict[str, Any] = {}
+    searched: dict[tuple[str, ...], tuple[Task, dict[str, Any]]] = {}
     visits = every * (PASSES if len(every) > 1 else 1)
     for number, place in enumerate(visits, 1):
-        tasks: list[tuple[str, Task]] = []
+        tasks: list[tuple[tuple[str, ...], Task]] = []
+        keys: dict[str, tuple[str, ...]] = {}
         for law in laws:
             made = with_laws(scene, {**taken, place: law})
             asked = learn_under(made, wanted, place)
             unknowns = unknowns_of(made, asked, grids=grids, offset=offset)
             label = repr(sorted(places(made).items()))
+            # laws of all places together, as an earlier visit may have tried them
+            key = keys[law] = (label, *sorted(p.key for p in unknowns.parameters))
+            if key in searched:
+                continue
             for begin in unknowns.starts(starts, seed):
                 at = _kept(unknowns, begin, values, place)
                 one = Task(made, target, unknowns, at, dx, SEEN, grids, True, label, device)
-                tasks.append((law, one))
+                tasks.append((key, one))
         done = zip(tasks, runner(run_task, [task for _, task in tasks]), strict=True)
-        best: dict[str, tuple[Task, dict[str, Any]]] = {}
-        for (law, task), found in done:
-            if law not in best or found["cost"] < best[law][1]["cost"]:
-                best[law] = (task, found)
+        for (key, task), found in done:
+            if key not in searched or found["cost"] < searched[key][1]["cost"]:
+                searched[key] = (task, found)
+        best = {law: searched[key] for law, key in keys.items()}
         judged = {law: _facts(*pair, len(target.times)) for law, pair in best.items()}
         law, alike = pick(judged)
         taken[place], report[place] = law, {"taken": law, "alike": alike, "tried": judged}

@@ -191,9 +191,11 @@ def run_field(task: FieldTask) -> dict[str, Any]:
     for number, temperature in enumerate(TEMPERATURES):
         for grid in grids:
             grid.temperature = temperature
+        problem.forget()
         part = (0.5, 1.0) if number == 0 else (1.0,)
         finer = grids[1] if task.grids == 2 else None
-        found = in_stages(problem, free, finer=finer, shares=part, weigh=False)
+        last = temperature == TEMPERATURES[-1]
+        found = in_stages(problem, free, finer=finer, shares=part, settle=last, weigh=False)
         free = found.free
     runs = [grid.runs for grid in grids]
     return {"values": unknowns.values(free), "rms": found.rms, "runs": runs}

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import FINER, Unknowns
+from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.targets.target import Followers, Motion, Observer
 
 Array = NDArray[np.float64]
@@ -31,12 +32,16 @@ CLOSE = 2e-4
 """A step this short, in free coordinates, ends a stage."""
 SETTLED = 1e-3
 """A step that lowers the cost by less than this part of it ends a stage."""
+ENOUGH = 0.5
+"""So little [nats] is no news: it ends a search whose numbers are not the last."""
 UNSURE = 0.25
 """Of what a finer grid changes in a frame, the part that is not believed."""
 TELLING, QUIET = 30, 0.05
 """Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
 CORRECTIONS = 4
 """How often at most the change by a finer grid is seen anew, on all frames."""
+NEAR = (0.8, 1.02)
+"""Of the step that numbers could take, the steps that are not worth a change."""
 SHARES = (0.25, 0.5, 0.75, 1.0)
 """Of the frames, stage by stage."""
 
@@ -116,6 +121,11 @@ class Problem:
         self.change: Motion | None = None
         self.trust = np.ones(len(forward.times))
         self._last: tuple[Any, Motion] | None = None
+        self._dt: float | None = None
+
+    def forget(self) -> None:
+        """Keep no run: the same coordinates move otherwise from now on."""
+        self._last = None
 
     def motion(self, free: Array, frames: int, dt: float, *, keep: bool = False) -> Motion:
         """Run these coordinates; of a run that is kept only what the grid changes is done anew."""
@@ -196,8 +206,14 @@ class Problem:
                 self.trust[k] = 1.0 / max(size, QUIET)
 
     def dt(self, free: Array) -> float:
-        """A time step for a linearisation about them."""
-        return self.forward.step(self.fixed | self.unknowns.values(free))
+        """A time step for a linearisation about them: the last one as long as it is near.
+
+        Then a step of the search that was taken is the middle of the next linearisation.
+        """
+        wanted = self.forward.step(self.fixed | self.unknowns.values(free))
+        if self._dt is None or not NEAR[0] * wanted <= self._dt <= NEAR[1] * wanted:
+            self._dt = wanted
+        return self._dt
 
     def seen(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
         """Residuals and their frames."""
@@ -223,6 +239,7 @@ def search(
     *,
     active: NDArray[np.bool_] | None = None,
     rounds: int = 12,
+    enough: float = 0.0,
     tell: Tell | None = None,
 ) -> Fitted:
     """Search from a start on the first frames.
@@ -233,6 +250,7 @@ def search(
         frames: How many frames count.
         active: Coordinates that may change; all when None.
         rounds: Most linearisations.
+        enough: A step that lowers the cost by less than this ends it, too.
         tell: Told of each.
 
     Raises:
@@ -262,14 +280,14 @@ def search(
             trial = free.copy()
             trial[rows] += step
             try:
-                moved_to = problem.motion(trial, frames, at.dt)
+                moved_to = problem.motion(trial, frames, at.dt, keep=True)
                 found = problem.seen(moved_to, frames, at.pairs)[0] / scale
                 there = cost_of(found)
                 there += 0.5 * float((prior * (trial - unknowns.start) ** 2).sum())
             except TooFast:
                 there = np.inf
             if there < here:
-                little = here - there < SETTLED * here
+                little = here - there < max(SETTLED * here, enough)
                 free, moved, better = trial, float(np.abs(step).max()), True
                 damping = max(damping / DAMPING[1], 1e-8)
                 break
@@ -446,7 +464,8 @@ def in_stages(
     moving = problem.unknowns.motion_only()
     before = contact_frame(problem, free)
     if moving.any() and before >= 3:
-        free = search(problem, free, before, active=moving, rounds=6, tell=tell).free
+        free = search(problem, free, before, active=moving, rounds=6, enough=ENOUGH,
+                      tell=tell).free  # fmt: skip
     runs = problem.forward.runs
     found = None
     counts = sorted({max(2, round(share * frames)) for share in shares})
@@ -457,7 +476,8 @@ def in_stages(
                 problem.refine(finer, free, count)
             if weigh and number and found is not None:
                 problem.reweigh(found.per_frame, found.count)
-            found = search(problem, free, count, rounds=12 if last else 5, tell=tell)
+            found = search(problem, free, count, rounds=12 if last else 5,
+                           enough=0.0 if last and weigh else ENOUGH, tell=tell)  # fmt: skip
             moved, free = float(np.abs(found.free - free).max()), found.free
             if (number or not weigh) and moved < 10.0 * CLOSE:
                 break

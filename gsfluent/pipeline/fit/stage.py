@@ -31,6 +31,7 @@ from gsfluent.pipeline.fit.task import (
     run_task,
     unknowns_of,
 )
+from gsfluent.pipeline.fit.together import together
 from gsfluent.pipeline.matter.points import grid_spacing
 from gsfluent.pipeline.stage import Stage
 from gsfluent.progress import Progress, report_progress
@@ -93,7 +94,7 @@ class Fit(Stage):
         grids: 2 to see on a grid twice as fine what the first does wrong, and take it out; or 1.
         offset: Learn how much higher than the floor the grid holds matter up, too.
         seed: Of the starts.
-        runner: Does the searches; one after the other when absent.
+        runner: Does the searches; when absent one after the other, or on a GPU as one run.
         device: Where the solver runs, in float64; pictures and algebra are done on the CPU.
 
     Raises:
@@ -114,7 +115,7 @@ class Fit(Stage):
         grids: int = 2,
         offset: bool = True,
         seed: int = 0,
-        runner: Runner = one_by_one,
+        runner: Runner | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(seed=seed)
@@ -131,7 +132,9 @@ class Fit(Stage):
             )
         if not 2 <= nodes <= 8:
             raise InputError(f"fit: nodes is {nodes}", "give a number from 2 to 8")
-        self.offset, self.runner, self.device = offset, runner, str(torch.device(device))
+        self.offset, self.device = offset, str(torch.device(device))
+        plain = together if self.device.startswith("cuda") else one_by_one
+        self.runner: Runner = plain if runner is None else runner
 
     def forward(self, scene: Scene, target: Target, *, progress: Progress | None = None) -> Found:
         """Learn.

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.fit.forward import Forward, TooFast
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import FINER, OFFSET, Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, in_stages, run_at
+from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.scene.scene import Scene
 from gsfluent.targets.target import Target
 
@@ -68,7 +69,8 @@ def run_task(task: Task) -> dict[str, Any]:
     problem = Problem(forward, observer, task.unknowns, task.target.step)
     try:
         found = in_stages(problem, np.asarray(task.start), finer=finer, shares=task.shares,
-                         settle=task.judge or task.shares[-1] == 1.0)  # fmt: skip
+                         settle=task.judge or task.shares[-1] == 1.0,
+                         weigh=not task.judge)  # fmt: skip
     except TooFast:
         return {"cost": float("inf"), "free": list(task.start), "runs": forward.runs}
     judged = judge(problem, found.free, task.shares[-1], finer) if task.judge else {}

@@ -1,6 +1,7 @@
 """Materials learnt from tracks: error and bands on random scenes, truth by the whole simulation.
 
 python scripts/study/fit/tracks.py --scenes 10 --jobs 16 --minutes 8  # a process a core; goes on
+python scripts/study/fit/tracks.py --scenes 10 --jobs 5 --beside 10 --device cuda  # ten as one run
 
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
@@ -34,6 +35,7 @@ from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.solve import Problem, linearise
 from gsfluent.pipeline.fit.stage import Found
 from gsfluent.pipeline.fit.task import RATIO, Task, one_by_one
+from gsfluent.pipeline.fit.together import together
 from gsfluent.scene.scene import Scene
 from gsfluent.targets import Points
 
@@ -207,13 +209,39 @@ def record(
 ) -> dict[str, Any]:
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
+    return fitted(shown(kind, number, cells, device), kept, device)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """A scene and what was seen of it."""
+
+    kind: str
+    number: int
+    cells: int
+    true: dict[str, float]
+    velocity: np.ndarray
+    guess: Scene
+    tracks: np.ndarray
+    points: int
+    seconds: float
+
+
+def shown(kind: str, number: int, cells: int, device: str) -> Shown:
+    """Simulate the truth of a scene."""
     here = KINDS[kind]
     random = np.random.default_rng([number, len(kind)])
     begun = clock.perf_counter()
     solid, velocity, true, tracks, points = seen(here, number, cells, random, device)
-    middle = clock.perf_counter()
     guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))
-    learn = [f"it.{name}" for name in (*true, "velocity")]
+    seconds = clock.perf_counter() - begun
+    return Shown(kind, number, cells, true, velocity, guess, tracks, points, seconds)
+
+
+def fitted(made: Shown, kept: Path | None, device: str) -> dict[str, Any]:
+    """Fit to what was seen; errors."""
+    begun = clock.perf_counter()
+    learn = [f"it.{name}" for name in (*made.true, "velocity")]
     searches: list[tuple[Task, dict[str, Any]]] = []
 
     def runner(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
@@ -222,20 +250,45 @@ def record(
         searches.extend(zip(tasks, done, strict=True))
         return done
 
-    fit = Fit(learn, starts=1, cells=cells, runner=runner, device=device)
-    found = fit(guess, Points(tracks, fps=FPS))
+    fit = Fit(learn, starts=1, cells=made.cells, runner=runner, device=device)
+    found = fit(made.guess, Points(made.tracks, fps=FPS))
     end = clock.perf_counter()
     if kept is not None:
-        keep(*searches[-1], kept / f"{kind}_{number}.npz")
-    errors = errors_of(found, true, velocity)
+        keep(*searches[-1], kept / f"{made.kind}_{made.number}.npz")
     return {
-        "kind": kind, "scene": number, "cells": cells, "rows": errors,
-        "rms_mm": found.report["rms"] * 2**0.5, "truth_points": points,
+        "kind": made.kind, "scene": made.number, "cells": made.cells,
+        "rows": errors_of(found, made.true, made.velocity),
+        "rms_mm": found.report["rms"] * 2**0.5, "truth_points": made.points,
         "grid": {k: found.values[k] for k in ("floor.offset", "grid.extrapolation")},
         "runs": [g["runs"] for g in found.report["grids"]],
         "points": [g["points"] for g in found.report["grids"]],
-        "truth_seconds": middle - begun, "fit_seconds": end - middle, "device": device,
+        "truth_seconds": made.seconds, "fit_seconds": end - begun, "device": device,
     }  # fmt: skip
+
+
+def beside(
+    kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, path: Path
+) -> list[dict[str, Any]]:
+    """Scenes of one matter, whose fits wait for each other; each is added to a file at its end."""
+    torch.set_num_threads(1)
+
+    def one(made: Shown) -> dict[str, Any] | None:
+        try:
+            row = fitted(made, kept, device)
+        except Exception as error:  # the others go on
+            print(f"{kind} {made.number}: {error!r}", file=sys.stderr, flush=True)
+            return None
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(row) + "\n")
+        return row
+
+    begun = clock.perf_counter()
+    made = [shown(kind, number, cells, device) for number in numbers]
+    middle = clock.perf_counter()
+    rows = [row for row in together(one, made) if row is not None]
+    print(f"{kind}: {len(rows)} scenes, truth {middle - begun:.1f} s, fits "
+          f"{clock.perf_counter() - middle:.1f} s", flush=True)  # fmt: skip
+    return rows
 
 
 def table(records: list[dict[str, Any]]) -> str:
@@ -279,7 +332,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in lines]
 
 
-def patiently(function: Callable[..., dict[str, Any]], *task: Any) -> dict[str, Any]:
+def patiently(function: Callable[..., Any], *task: Any) -> Any:
     """Call it; once more after a while where the driver was not ready (a server that starts)."""
     try:
         return function(*task)
@@ -291,7 +344,7 @@ def patiently(function: Callable[..., dict[str, Any]], *task: Any) -> dict[str, 
 
 
 def in_pool(
-    function: Callable[..., dict[str, Any]],
+    function: Callable[..., Any],
     tasks: list[tuple[Any, ...]],
     path: Path,
     jobs: int,
@@ -299,7 +352,8 @@ def in_pool(
 ) -> list[dict[str, Any]]:
     """Call a function with each of the tasks, and add what comes to a file, until time is up.
 
-    A process has one thread. What fails is told, and the others go on.
+    A process has one thread. What fails is told, and the others go on. A function that gives a list
+    has added it by itself.
     """
     end, records = clock.monotonic() + 60.0 * minutes, []
     os.environ.update({f"{kind}_NUM_THREADS": "1" for kind in ("OMP", "MKL", "OPENBLAS")})
@@ -310,7 +364,10 @@ def in_pool(
                 if (error := call.exception()) is not None:
                     print(f"{calls[call]}: {error!r}", file=sys.stderr, flush=True)
                     continue
-                records.append(call.result())
+                if isinstance(made := call.result(), list):
+                    records += made
+                    continue
+                records.append(made)
                 with path.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(records[-1]) + "\n")
         except TimeoutError:
@@ -334,6 +391,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--beside", type=int, default=1, help="scenes whose fits are one run")
     parser.add_argument(
         "--minutes", type=float, default=1e6, help="what is not done by then is left"
     )
@@ -346,10 +404,21 @@ def main() -> None:
         options.keep.mkdir(parents=True, exist_ok=True)
     records = read(path)
     done = {(r["kind"], r["scene"]) for r in records}
-    slow_first = [(k, n) for n in range(options.scenes) for k in reversed(options.only)]
-    wanted = [pair for pair in slow_first if pair not in done]
-    tasks = [(k, n, options.cells, options.keep, options.device) for k, n in wanted]
-    records += in_pool(record, tasks, path, options.jobs, options.minutes)
+    kept, device, cells = options.keep, options.device, options.cells
+    slow_first = [k for k in reversed(KINDS) if k in options.only]
+    if options.beside > 1:
+        groups = [
+            (k, some[i : i + options.beside], cells, kept, device, path)
+            for k in slow_first
+            if (some := [n for n in range(options.scenes) if (k, n) not in done])
+            for i in range(0, len(some), options.beside)
+        ]
+        in_pool(beside, groups, path, options.jobs, options.minutes)
+    else:
+        wanted = [(k, n) for n in range(options.scenes) for k in slow_first if (k, n) not in done]
+        tasks = [(k, n, cells, kept, device) for k, n in wanted]
+        in_pool(record, tasks, path, options.jobs, options.minutes)
+    records = read(path)
     if records:
         entered(options.markdown, "fit", table(records))
 

@@ -82,7 +82,7 @@ def right(found: Scene) -> float:
 @pytest.mark.timeout(1200)
 def test_two_laws_in_a_block_are_told_apart() -> None:
     """Rubber on clay, on the grid of the truth: 95 % of its matter under the right law."""
-    tracks, _ = seen(halves(BELOW, elastic(1e5)), DX, frames=10)
+    tracks, _ = seen(halves(BELOW, elastic(1e5)), DX, frames=7)
     guess, laws = scene(elastic(5e4)), ("elastic", "von_mises")
     found = run_field(FieldTask(guess, Points(tracks), laws, {}, DX, 1, False, 2))
     assert right(divided(guess, laws, found["values"], 2)) > 0.95
