@@ -163,7 +163,8 @@ class SolverState:
         own = rows[law == LAWS["phase_field"]].double()
         most = float(own[:, 11].max())
         stiff = float((own[:, 11] * 2.0 * (own[:, 4] / self.dx) ** 2).max())
-        bits = sum_bits(self.count)
+        # in float the window of a home holds two words of each (csrc/cuda/solver/damage.cu)
+        bits = min(sum_bits(self.count), 52 if self.dtype == torch.float64 else 41)
         units = [
             math.ldexp(1.0, math.frexp(bound)[1] - bits)
             for bound in (most, most * DRIVE_MAX, stiff, most)

@@ -57,24 +57,36 @@ GSF_HOST_DEVICE bool takes_part(T alpha, T peak, T active) {
   return alpha > active || peak > T(-kBrokenDamage);
 }
 
+// Whether fewer terms and steps do: in float, on the GPU (on the CPU a pack does what a number
+// does).
+#ifdef __CUDA_ARCH__
+template <typename T>
+inline constexpr bool kFewDigits = sizeof(T) == 4;
+#else
+template <typename T>
+inline constexpr bool kFewDigits = false;
+#endif
+
 // x - ln(1 + x) of x = J^2 - 1 between these, by the series of the inverse hyperbolic tangent of
 // z = x / (2 + x): x - 2 z is x z, so that nothing cancels.
 inline constexpr double kSeriesPressed = -0.3, kSeriesOpen = 0.45;
 template <typename T>
 GSF_HOST_DEVICE T volume_series(T x) {
   const T z = x / (T(2) + x), square = z * z;
-  T sum = T(1.0 / 25.0);
-  for (int n = 23; n >= 3; n -= 2) sum = T(1.0 / double(n)) + square * sum;
+  constexpr int kTerms = kFewDigits<T> ? 11 : 25;
+  T sum = T(1.0 / double(kTerms));
+  for (int n = kTerms - 2; n >= 3; n -= 2) sum = T(1.0 / double(n)) + square * sum;
   return z * (x - T(2) * square * sum);
 }
 
-// Root y of det((1 + y) I + d) = 1 for |d| up to a half, by three Newton steps (core/sym3.h).
+// Root y of det((1 + y) I + d) = 1 for |d| up to a half, by Newton's steps (core/sym3.h): the first
+// is off by 5e-3 of it, the second by 1e-5, the third by 1e-10.
 template <typename T>
 GSF_HOST_DEVICE T unit_det_shift_small(const Sym3<T>& d) {
   const T h = T(0.5) * norm2(d);
   const T c = h - det(d);
   T y = c / (T(3) - h);
-  for (int i = 0; i < 4; ++i) {
+  for (int i = 0; i < (kFewDigits<T> ? 2 : 4); ++i) {
     const T f = ((y + T(3)) * y + (T(3) - h)) * y - c;
     y -= f / ((T(3) * y + T(6)) * y + (T(3) - h));
   }
@@ -137,6 +149,30 @@ GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m,
 }
 
 template <typename T>
+GSF_HOST_DEVICE T alpha_after(const MaterialRow<T>& m, T alpha, T active) {
+  const T drive = m.strength > T(0) ? active / m.strength : T(0);
+  return max(alpha, min(drive, T(kDriveMax)) - T(1));
+}
+
+// What phase_field does where neither bounds nor large strains come in, and the split is not
+// spectral: stress and alpha. Otherwise false.
+template <typename T>
+GSF_HOST_DEVICE bool phase_field_small(const MaterialRow<T>& m, const Sym3<T>& e, Sym3<T>& stress,
+                                       T& alpha) {
+  const ElasticState<T> s = elastic_state(e, false);
+  if (s.guarded || !(s.n < T(kBrokenShearMax)) || !(s.j2m1 > T(kSeriesPressed)) ||
+      !(s.j2m1 < T(kBrokenVolumeMax)))
+    return false;
+  const T all = split_of(m) == kSplitNone ? T(1) : T(0);
+  const PhaseState<T> now =
+      phase_state(m.mu, m.kappa, m.cohesion, all, s.d, unit_det_shift_small(s.d), s.j2m1,
+                  [](T x) { return volume_series(x); });
+  stress = now.stress;
+  alpha = alpha_after(m, alpha, now.active);
+  return true;
+}
+
+template <typename T>
 GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym3<T>& e, T alpha,
                                               bool inverted) {
   using std::log1p;
@@ -174,8 +210,7 @@ GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym
     now = phase_state(m.mu, m.kappa, m.cohesion, all, s.d, shift, s.j2m1, volume);
   }
   out.stress = now.stress;
-  const T drive = m.strength > T(0) ? now.active / m.strength : T(0);
-  out.alpha = max(alpha, min(drive, T(kDriveMax)) - T(1));
+  out.alpha = alpha_after(m, alpha, now.active);
   return out;
 }
 

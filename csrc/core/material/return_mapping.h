@@ -80,6 +80,29 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
   return out;
 }
 
+template <typename T>
+GSF_HOST_DEVICE_COLD ReturnMapped<T> return_mapping_field(Sym3<T> strain, T alpha,
+                                                          Mat3<T> increment, int law,
+                                                          MaterialRow<T> m, NaccOptions<T> o,
+                                                          T dt) {
+  return return_mapping<true>(strain, alpha, increment, law, m, o, dt);
+}
+// The same where most points are of phase_field and little strained: those are done here.
+template <typename T>
+GSF_HOST_DEVICE ReturnMapped<T> field_mapping(const Sym3<T>& strain, T alpha,
+                                              const Mat3<T>& increment, int law,
+                                              const MaterialRow<T>& m, const NaccOptions<T>& o,
+                                              T dt) {
+  if (law == kPhaseField && split_of(m) != kSplitSpectral) {
+    const Sym3<T> e = update_strain(strain, increment);
+    ReturnMapped<T> out{e, e, alpha, false, false, false, false};
+    if (finite(e) && finite(alpha) && det_identity_plus(increment) > T(0) &&
+        phase_field_small(m, e, out.stress, out.alpha))
+      return out;
+  }
+  return return_mapping_field(strain, alpha, increment, law, m, o, dt);
+}
+
 struct ReturnFlags {
   bool plastic, guarded, inverted, invalid;
 };

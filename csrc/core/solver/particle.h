@@ -277,8 +277,10 @@ GSF_HOST_DEVICE ReturnMapped<T> law_step(const Sym3<T>& strain, T alpha, const M
                                          T dt) {
   if constexpr (kLaws == kMoreLaws)
     return return_mapping_more(strain, alpha, increment, law, m, o, dt);
+  else if constexpr (kLaws == kDamageField)
+    return field_mapping(strain, alpha, increment, law, m, o, dt);
   else
-    return return_mapping<kLaws == kDamageField>(strain, alpha, increment, law, m, o, dt);
+    return return_mapping<false>(strain, alpha, increment, law, m, o, dt);
 }
 template <typename T, int kLaws>
 GSF_HOST_DEVICE T law_wave_squared(int law, const MaterialRow<T>& m, const Sym3<T>& strain) {

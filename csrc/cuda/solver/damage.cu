@@ -1,19 +1,72 @@
 // Phase-field matter on the GPU: the damage field of a step, then g2p with its law. On the CPU:
 // cpu/solver/damage.h; what both do: core/solver/damage.h.
 //
-// Where nothing is near its threshold the field costs one kernel that ends at once. Elsewhere that
-// kernel does all of it, and its CTAs wait for each other between the parts (a cooperative launch):
-// a dozen kernels in a row would cost unbroken matter more than everything else here. Lists are in
-// whatever order; sums are whole numbers, and a node is relaxed from nodes of the other colour.
+// The field hangs on nothing that p2g and the nodes do, and so runs beside them, on a part of each
+// multiprocessor. One kernel does all of it, and its CTAs wait for each other between the parts (a
+// cooperative launch): most of its time is waiting, which the others fill. Where nothing is near
+// its threshold it ends at once. Lists are in whatever order; sums are whole numbers, and a node is
+// relaxed from nodes of the other colour.
 #include <cooperative_groups.h>
+
+#include <map>
+#include <mutex>
 
 #include "cuda/solver/g2p.h"
 
 namespace gsf::cuda {
 namespace {
 
-// Threads of a CTA, and CTAs of a multiprocessor, all of which run at once.
-constexpr int kDamageThreads = 512, kDamageCtas = 2;
+// Threads of a CTA, of which each multiprocessor runs one: half of its registers are left to p2g.
+constexpr int kDamageThreads = 512, kDamageShare = 2;
+
+// Sums of a window in shared memory. There the GPU adds 32 bits at once, but 64 in a loop: in
+// float, whose units leave 41 bits to a point (ops/solver_state.py), each sum has two words of 21
+// bits and what is above. They have room for so many points.
+constexpr int kLowBits = 21, kChunk = 1 << (32 - kLowBits);
+constexpr double kWhole = 4503599627370496.0;  // 2^52: what is added to it is rounded to a whole
+template <typename T>
+struct DamageTile {
+  unsigned low[kDamageSums][kTile], high[kDamageSums][kTile];
+  __device__ void clear(int thread, int threads) {
+    for (int i = thread; i < kDamageSums * kTile; i += threads)
+      (&low[0][0])[i] = (&high[0][0])[i] = 0;
+  }
+  __device__ void add(int c, int at, double v) {
+    const uint64_t bits = static_cast<uint64_t>(__double_as_longlong(v + kWhole));
+    const unsigned below = static_cast<unsigned>(bits) & ((1u << kLowBits) - 1u);
+    const unsigned above = static_cast<unsigned>(bits >> kLowBits) & ((1u << (52 - kLowBits)) - 1u);
+    if (below != 0) atomicAdd(&low[c][at], below);
+    if (above != 0) atomicAdd(&high[c][at], above);
+  }
+  __device__ long long sum(int c, int at) const {
+    return (static_cast<long long>(high[c][at]) << kLowBits) + static_cast<long long>(low[c][at]);
+  }
+};
+template <>
+struct DamageTile<double> {
+  unsigned long long words[kDamageSums][kTile];
+  __device__ void clear(int thread, int threads) {
+    for (int i = thread; i < kDamageSums * kTile; i += threads) (&words[0][0])[i] = 0;
+  }
+  __device__ void add(int c, int at, double v) {
+    atomicAdd(&words[c][at], static_cast<unsigned long long>(__double2ll_rn(v)));
+  }
+  __device__ long long sum(int c, int at) const { return static_cast<long long>(words[c][at]); }
+};
+
+// Of the 27 blocks around a home, those that the stencil of a point touches.
+__device__ uint32_t blocks_touched(uint32_t meta) {
+  uint32_t row = 1u;  // one bit for each block so far: of x, then of x and y, then of all
+  for (int axis = 0; axis < 3; ++axis) {
+    const int l = min(meta_cell(meta, axis), kLastCell);
+    uint32_t next = 0;
+    for (int n = 0; n < (axis == 0 ? 1 : (axis == 1 ? 3 : 9)); ++n)
+      if ((row >> n & 1u) != 0)
+        next |= 1u << (3 * n + window_block(l)) | 1u << (3 * n + window_block(l + 2));
+    row = next;
+  }
+  return row;
+}
 
 // After a build slots have other numbers.
 template <typename T>
@@ -80,11 +133,10 @@ struct Solve {
   // Homes that meet them, what lies beyond their faces; their sums are cleared.
   __device__ void list() const {
     if (thread == 0) s.damage_counts[kHotCount] = 0;
-    for (int64_t h = thread; h < s.clock->homes; h += threads) {
-      bool meets = false;
-      for (int n = 0; n < kNeighbours && !meets; ++n)
-        meets = active(s.neighbour[h * kNeighbours + n]);
-      if (meets)
+    const int lane = static_cast<int>(threadIdx.x & 31u);
+    for (int64_t h = thread / 32; h < s.clock->homes; h += threads / 32) {  // a warp for each
+      const bool meets = lane < kNeighbours && active(s.neighbour[h * kNeighbours + lane]);
+      if (__any_sync(kAllLanes, meets) && lane == 0)
         s.damage_homes[atomicAdd(s.damage_counts + kHomeCount, 1)] = static_cast<int32_t>(h);
     }
     const int64_t slots = s.damage_counts[kActiveCount];
@@ -103,50 +155,57 @@ struct Solve {
   }
 
   // Sums of the points of one home, by a CTA.
-  __device__ void scatter(int64_t home, unsigned long long (&tile)[kDamageSums][kTile]) const {
-    for (int i = threadIdx.x; i < kDamageSums * kTile; i += kDamageThreads) (&tile[0][0])[i] = 0;
-    __syncthreads();
+  __device__ void scatter(int64_t home, DamageTile<T>& tile) const {
+    const int32_t* neighbour = s.neighbour + home * kNeighbours;
+    const int lane = static_cast<int>(threadIdx.x & 31u);
+    const uint32_t wanted = __ballot_sync(kAllLanes, lane < kNeighbours && active(neighbour[lane]));
     const HomeList<T>& homes = s.homes();
     const int64_t first = homes.start[home];
-    const int64_t count = min(int64_t(homes.count[home]), s.count - first);
+    const int64_t count = first < 0 ? 0 : min(int64_t(homes.count[home]), s.count - first);
     double per_unit[kDamageSums];
     for (int c = 0; c < kDamageSums; ++c) per_unit[c] = 1.0 / s.damage_scale[c];
-    for (int64_t i = threadIdx.x; first >= 0 && i < count; i += kDamageThreads) {
-      const int64_t p = first + i;
-      T offset[3];
-      const uint32_t meta = load_place(s, p, offset);
-      const uint32_t row = s.row_of(meta);
-      if (s.law[row] != kPhaseField) continue;
-      double given[kDamageSums];
-      const T* r = s.rows + int64_t(row) * kRowColumns;
-      damage_given(double(r[kStressColumn]), double(r[4]) * double(s.inv_dx), double(s.alpha[p]),
-                   double(s.peak[p]), given);
-      for (int c = 0; c < kDamageSums; ++c) given[c] *= per_unit[c];
-      const Stencil<T> st = stencil_at(offset);
-      const int base = window_base(meta);
-      for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) {
-          const double across = double(st.w[0][i] * st.w[1][j]);
-          for (int k = 0; k < 3; ++k) {
-            const double w = across * double(st.w[2][k]);
-            const int at = base + i * kStrideX + j * kStrideY + k;
-            for (int c = 0; c < kDamageSums; ++c)
-              if (given[c] != 0.0)
-                atomicAdd(&tile[c][at],
-                          static_cast<unsigned long long>(__double2ll_rn(w * given[c])));
-          }
+    for (int64_t begin = 0; begin < count; begin += kChunk) {
+      tile.clear(static_cast<int>(threadIdx.x), kDamageThreads);
+      __syncthreads();
+      const int64_t end = min(begin + int64_t(kChunk), count);
+      for (int64_t r = begin + threadIdx.x; r < end; r += kDamageThreads)
+        give(first + r, wanted, per_unit, tile);
+      __syncthreads();
+      for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
+        int i, j, k;
+        const int at = window_node(index, i, j, k);
+        if ((wanted >> neighbour_of(i, j, k) & 1u) == 0) continue;
+        int64_t* sums = s.damage_sums + kDamageSums * slot_node(neighbour, i, j, k);
+        for (int c = 0; c < kDamageSums; ++c)
+          if (const long long v = tile.sum(c, at); v != 0) add_units(sums + c, v);
+      }
+      __syncthreads();
+    }
+  }
+  __device__ void give(int64_t p, uint32_t wanted, const double (&per_unit)[kDamageSums],
+                       DamageTile<T>& tile) const {
+    T offset[3];
+    const uint32_t meta = load_place(s, p, offset);
+    if ((blocks_touched(meta) & wanted) == 0) return;
+    const uint32_t row = s.row_of(meta);
+    if (s.law[row] != kPhaseField) return;
+    double given[kDamageSums];
+    const T* r = s.rows + int64_t(row) * kRowColumns;
+    damage_given(double(r[kStressColumn]), double(r[4]) * double(s.inv_dx), double(s.alpha[p]),
+                 double(s.peak[p]), given);
+    for (int c = 0; c < kDamageSums; ++c) given[c] *= per_unit[c];
+    const Stencil<T> st = stencil_at(offset);
+    const int base = window_base(meta);
+    for (int i = 0; i < 3; ++i)
+      for (int j = 0; j < 3; ++j) {
+        const double across = double(st.w[0][i] * st.w[1][j]);
+        for (int k = 0; k < 3; ++k) {
+          const double w = across * double(st.w[2][k]);
+          const int at = base + i * kStrideX + j * kStrideY + k;
+          for (int c = 0; c < kDamageSums; ++c)
+            if (given[c] != 0.0) tile.add(c, at, w * given[c]);
         }
-    }
-    __syncthreads();
-    const int32_t* neighbour = s.neighbour + home * kNeighbours;
-    for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
-      int i, j, k;
-      const int at = window_node(index, i, j, k);
-      if (!active(neighbour[neighbour_of(i, j, k)])) continue;
-      int64_t* sums = s.damage_sums + kDamageSums * slot_node(neighbour, i, j, k);
-      for (int c = 0; c < kDamageSums; ++c)
-        if (tile[c][at] != 0) add_units(sums + c, static_cast<long long>(tile[c][at]));
-    }
+      }
   }
 
   // The equation of every node.
@@ -234,11 +293,11 @@ struct Solve {
 };
 
 template <typename T>
-__global__ void __launch_bounds__(kDamageThreads, kDamageCtas)
+__global__ void __launch_bounds__(kDamageThreads, kDamageShare)
     damage_kernel(const __grid_constant__ SolverView<T> s) {
   // The same for all CTAs: nobody writes these before all have come to the first wait.
   if (!may_step(*s.clock) || s.damage_counts[kHotCount] == 0) return;
-  __shared__ unsigned long long sums[kDamageSums][kTile];
+  __shared__ DamageTile<T> sums;
   __shared__ T field[kTile];
   const cooperative_groups::grid_group all = cooperative_groups::this_grid();
   const Solve<T> solve{s, damage_stamp(s.clock->step),
@@ -249,10 +308,7 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageCtas)
   solve.list();
   all.sync();
   const int64_t homes = s.damage_counts[kHomeCount];
-  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) {
-    solve.scatter(s.damage_homes[i], sums);
-    __syncthreads();
-  }
+  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) solve.scatter(s.damage_homes[i], sums);
   all.sync();
   solve.prepare();
   for (int half = 0; half < 2 * kSweeps; ++half) {
@@ -267,6 +323,33 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageCtas)
   }
 }
 
+// A stream beside that of a step, ahead of it where both want a multiprocessor, and the events at
+// which they part and meet. One of each for every device and kind of state, since steps of several
+// kinds may be captured at once.
+template <typename T>
+struct Beside {
+  cudaStream_t stream = nullptr;
+  cudaEvent_t parted = nullptr, done = nullptr;
+
+  static const Beside& here() {
+    static std::map<int, Beside> all;
+    static std::mutex mutex;
+    int device = 0;
+    cudaGetDevice(&device);
+    const std::lock_guard<std::mutex> lock(mutex);
+    const auto [found, is_new] = all.try_emplace(device);
+    Beside& b = found->second;
+    if (is_new) {
+      int least = 0, greatest = 0;
+      cudaDeviceGetStreamPriorityRange(&least, &greatest);
+      cudaStreamCreateWithPriority(&b.stream, cudaStreamNonBlocking, greatest);
+      cudaEventCreateWithFlags(&b.parted, cudaEventDisableTiming);
+      cudaEventCreateWithFlags(&b.done, cudaEventDisableTiming);
+    }
+    return b;
+  }
+};
+
 }  // namespace
 
 template <typename T>
@@ -277,28 +360,39 @@ void solver_damage_marks(const SolverView<T>& s, cudaStream_t stream) {
   mark_kernel<T><<<static_cast<unsigned>(s.home_capacity), kSolverThreads, 0, stream>>>(s);
 }
 
+// solver_step asks for errors.
 template <typename T>
-void solver_damage(const SolverView<T>& s, cudaStream_t stream) {
+void solver_damage_begin(const SolverView<T>& s, cudaStream_t stream) {
   int device = 0, processors = 1;
   cudaGetDevice(&device);
   cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device);
+  const Beside<T>& beside = Beside<T>::here();
+  cudaEventRecord(beside.parted, stream);
+  cudaStreamWaitEvent(beside.stream, beside.parted, 0);
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
   cudaLaunchAttribute together{};
   together.id = cudaLaunchAttributeCooperative;
   together.val.cooperative = 1;
   cudaLaunchConfig_t config{};
-  config.gridDim = dim3(min(homes, static_cast<unsigned>(kDamageCtas * processors)));
+  config.gridDim = dim3(min(homes, static_cast<unsigned>(processors)));
   config.blockDim = dim3(kDamageThreads);
-  config.stream = stream;
+  config.stream = beside.stream;
   config.attrs = &together;
   config.numAttrs = 1;
-  cudaLaunchKernelEx(&config, damage_kernel<T>, s);  // solver_step asks for errors
+  cudaLaunchKernelEx(&config, damage_kernel<T>, s);
+  cudaEventRecord(beside.done, beside.stream);
+}
+
+template <typename T>
+void solver_damage_end(const SolverView<T>& s, cudaStream_t stream) {
+  cudaStreamWaitEvent(stream, Beside<T>::here().done, 0);
   launch_g2p<T, kDamageField, false>(s, stream);
 }
 
 #define GSF_INSTANTIATE(T)                                                  \
   template void solver_damage_marks<T>(const SolverView<T>&, cudaStream_t); \
-  template void solver_damage<T>(const SolverView<T>&, cudaStream_t);
+  template void solver_damage_begin<T>(const SolverView<T>&, cudaStream_t); \
+  template void solver_damage_end<T>(const SolverView<T>&, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)
 #undef GSF_INSTANTIATE

@@ -204,7 +204,8 @@ __global__ void __launch_bounds__(kG2PThreads, g2p_ctas(kLaws, kKeeps))
 // one that looks whether there is a deformation serves both, which saves a fifth of the library.
 template <typename T, int kLaws, bool kKeeps>
 void launch_g2p(const SolverView<T>& s, cudaStream_t stream) {
-  constexpr bool kOwn = sizeof(T) == sizeof(float) && !kKeeps && kLaws <= kBrittle;
+  constexpr bool kOwn =
+      sizeof(T) == sizeof(float) && !kKeeps && (kLaws <= kBrittle || kLaws == kDamageField);
   const int shift = split_shift(s);
   const unsigned ctas = static_cast<unsigned>(s.home_capacity) << shift;
   if (!kOwn || s.deformation != nullptr)

@@ -43,11 +43,13 @@ void solver_end(const SolverView<T>& s, bool with_all, cudaStream_t stream);
 template <typename T>
 void solver_keep(const SolverView<T>& s, int law_set, cudaStream_t stream);
 // Phase-field matter: which slots have points whose damage is solved for, at the end of a build;
-// and what follows on the nodes of a step: the damage field, then g2p.
+// the damage field, beside all of a step up to its nodes; and g2p once both are done.
 template <typename T>
 void solver_damage_marks(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
-void solver_damage(const SolverView<T>& s, cudaStream_t stream);
+void solver_damage_begin(const SolverView<T>& s, cudaStream_t stream);
+template <typename T>
+void solver_damage_end(const SolverView<T>& s, cudaStream_t stream);
 // Points that are pushed: what of their rows a step needs, and what they get in one, in parts
 // between which several ranks wait for each other.
 template <typename T>

@@ -154,7 +154,7 @@ void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream)
   else if (law_set == kMoreLaws)
     launch_g2p<T, kMoreLaws, false>(s, stream);
   else if (law_set == kDamageField)
-    solver_damage(s, stream);
+    solver_damage_end(s, stream);
   else
     launch_g2p<T, kAnyLaw, false>(s, stream);
 }
@@ -169,6 +169,8 @@ cudaError_t solver_step(const SolverView<T>& s, int law_set, cudaStream_t stream
   if (s.own != nullptr) {
     solver_free_to_nodes(s, stream);
     solver_free_nodes(s, stream);
+  } else if (law_set == kDamageField) {
+    solver_damage_begin(s, stream);
   }
   for (int part = 0; part < points_parts(s); ++part) solver_points(s, part, stream);
   solver_to_nodes(s, stream);
