@@ -17,9 +17,12 @@ from gsfluent.spatial.neighbours import nearest_rows
 
 WETS = 4.0
 """Distance from a solid or the floor within which a sheet lies on it [spacings]."""
-THIN = (1.1, 1.5)
-"""Distance of the points in a sheet from which it tears, and at which it surely does [spacings]; it
-is 0.8 and 0.45 spacings thick there."""
+THIN = (0.45, 0.85)
+"""Thickness up to which a sheet surely tears, and from which on it holds, in :data:`SHEET` or in
+spacings, whichever are more."""
+SHEET = 1e-3
+"""However fine the points, a sheet thinner than about this [m] meets a drop, a bubble or a ripple
+that pierces it."""
 DROP = 0.75
 """Distance to which points of a torn sheet draw together [spacings]: nearly that inside a drop."""
 GRASP = 3.0
@@ -52,7 +55,8 @@ def in_air(position: Tensor, solid: Tensor, spacing: float, floor: float | None)
 def thinness(apart: Tensor, spacing: float) -> Tensor:
     """0 in a sheet that holds to 1 in one that tears, from the distance of its points [m]."""
     low, high = THIN
-    return ((apart / spacing - low) / (high - low)).clamp(0.0, 1.0)
+    thickness = spacing**3 / apart.square() / max(spacing, SHEET)
+    return ((high - thickness) / (high - low)).clamp(0.0, 1.0)
 
 
 def wetted(matter: Matter, scene: Scene) -> Tensor:

@@ -22,6 +22,9 @@ REACH = 0.55
 SPECK = 0.6
 """Openings between the discs that fill less than half of a square of this many spacings are closed:
 stretched matter has some."""
+LEVEL = 2.0
+"""Only where what is around differs in depth by less than this many spacings: two outlines that
+meet in the picture have a true gap between them."""
 RIM = 0.3
 """The silhouette is drawn in by this many spacings, and one pixel: a soft rim is not a hole."""
 BEHIND = 1.5
@@ -60,7 +63,11 @@ class MatterView:
             return cls(point, depth, seen, depth)
         own = spacing[point[seen]]
         pixels = float((camera.K[0, 0].to(own) * own / depth[seen]).median())
-        seen = _mostly(seen, round(0.5 * SPECK * pixels))
+        speck = round(0.5 * SPECK * pixels)
+        far = dilated(depth, speck)
+        near = -dilated(torch.where(seen, -depth, -torch.inf), speck)
+        level = far - near < LEVEL * float(own.median())
+        seen = seen | (_mostly(seen, speck) & level)
         rim = round(RIM * pixels) + 1
         back = dilated(depth, round(pixels)) + BEHIND * float(own.median())
         return cls(point, depth, erode(seen, rim), back)

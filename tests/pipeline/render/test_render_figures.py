@@ -81,6 +81,22 @@ def test_a_round_hole_counts_with_its_area(radius: float) -> None:
     assert found.through == 0.0  # there is nothing behind
 
 
+def test_a_slit_is_a_hole_in_one_surface_and_none_between_two_bodies() -> None:
+    left, wide = slab(half=0.05), 1.1 * STEP  # too narrow for the points to know of
+
+    def slit(depth: float) -> tuple[torch.Tensor, Holes]:
+        right = left + torch.tensor([0.1 - STEP + wide, depth, 0.0])
+        points = torch.cat([left, right]) - torch.tensor([0.05, 0.0, 0.0])
+        splats = fine(points, edge=5)
+        x = splats.means[:, 0]
+        return points, measured(splats.select((x < -0.5 * STEP) | (x > wide - 0.5 * STEP)), points)
+
+    torn, apart = slit(0.0), slit(0.06)
+    assert torn[1].fraction > 5e-3 and apart[1].fraction < 5e-4
+    # it belongs to the silhouette of the one, and parts those of the two
+    assert silhouette(torn[0]) > silhouette(apart[0]) + 0.5 * STEP * 0.1
+
+
 def test_a_faint_veil_counts_with_its_transmittance() -> None:
     points = slab(layers=1)
     one = Gaussians.from_colors(
