@@ -12,8 +12,10 @@ from gsfluent.data import SURFACE, Solid
 from gsfluent.demo.objects import DemoObject
 from gsfluent.demo.truth import grid_points
 from gsfluent.errors import InputError
+from gsfluent.spatial.neighbours import nearest_rows
 
 _PATCH = 7
+_WIDE = 12.0  # voxels: most of the inside is far from the skin
 
 
 def interior_error(
@@ -73,15 +75,14 @@ def interior_error(
 
 def surface_copy(solid: Solid, points: Tensor) -> Tensor:
     """The baseline: colour of the nearest surface Gaussian at each point [N, 3]."""
-    from scipy.spatial import cKDTree
-
     labels = solid.gaussians.labels
     assert labels is not None  # Solid checks it; narrows the type
     surface = solid.gaussians.select(labels == SURFACE)
     if surface.count == 0:
         raise InputError("interior_error: the solid has no surface Gaussians", "fill it again")
-    _, nearest = cKDTree(surface.means.cpu().numpy()).query(points.numpy())
-    return surface.colors().cpu().clamp(0.0, 1.0)[torch.from_numpy(nearest)]
+    width = _WIDE * solid.voxel
+    nearest = nearest_rows(surface.means, points.to(surface.device), 1, width)[1][:, 0]
+    return surface.colors().clamp(0.0, 1.0)[nearest].to(points.device)
 
 
 def _true_count(truth: DemoObject, voxel: float) -> int:

@@ -155,7 +155,7 @@ def _run(
     shot = Shot.from_dict(values)
 
     def judge(context: RunContext) -> dict[str, Any]:
-        solid = load_solid(context.store.root / "texture" / f"{name}.ply")
+        solid = load_solid(context.store.root / "texture" / f"{name}.ply").to(device)
         error = interior_error(solid, load_truth(made.folder / "truth.npz"), seed=seed)
         reconstruction = context.record.values["reconstruction"]
         return {"demo": {"interior_error": error, "psnr": reconstruction["psnr"]}}

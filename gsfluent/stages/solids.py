@@ -186,7 +186,7 @@ def texture_stage(context: RunContext) -> None:
     def work(folder: Path) -> dict[str, Any]:
         reports = []
         for name in shot.objects:
-            solid = load_solid(context.store.root / "fill" / f"{name}.ply")
+            solid = load_solid(context.store.root / "fill" / f"{name}.ply").to(context.device)
             if solid.color is not None and not options:
                 _log.info("texture: %s has an inside with colours already, they stay", name)
                 save_solid(solid, folder / f"{name}.ply")

@@ -302,17 +302,24 @@ def masked_views(capture: Capture) -> list[View]:
     return [view for view in views if view.mask is not None]
 
 
-def inside_masks(views: list[View], points: Tensor) -> Array:
-    """Share of the views with each point [N, 3] inside their mask, [N]; out of view is outside."""
+def inside_masks(views: list[View], points: Tensor, least: float = 0.0) -> Array:
+    """Share of the views with each point [N, 3] inside their mask, [N]; out of view is outside.
+
+    Points that cannot reach ``least`` any more are not looked for in further views.
+    """
     votes = torch.zeros(len(points), dtype=torch.float64)
-    for view in views:
-        if view.mask is None:
-            continue
+    left = torch.arange(len(points))
+    masked = [view for view in views if view.mask is not None]
+    for number, view in enumerate(masked, 1):
+        assert view.mask is not None
         pixels, depth = view.camera.project(points)
         place = pixels.floor().long()
         limit = torch.tensor([view.camera.width, view.camera.height])
         seen = (depth > 0) & (place >= 0).all(dim=1) & (place < limit).all(dim=1)
-        votes[seen] += (view.mask[place[seen, 1], place[seen, 0]] > 0.5).double()
+        seen[seen.clone()] = view.mask[place[seen, 1], place[seen, 0]] > 0.5
+        votes[left[seen]] += 1.0
+        kept = (votes[left] + len(masked) - number) / max(1, len(views)) >= least
+        left, points = left[kept], points[kept]
     return np.asarray((votes / max(1, len(views))).numpy())
 
 
@@ -356,7 +363,7 @@ def hull_grid(
         count = counts.pop(0)
         axes = [np.linspace(a, b, count) for a, b in zip(low, high, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        shares = inside_masks(views, torch.from_numpy(grid.reshape(-1, 3)))
+        shares = inside_masks(views, torch.from_numpy(grid.reshape(-1, 3)), _AGREE)
         seen, inside = inside.any(), (shares >= _AGREE).reshape((count,) * 3)
         if not inside.any():
             if seen:

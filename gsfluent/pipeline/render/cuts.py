@@ -244,27 +244,30 @@ class _Trace:
 
     def _march(self, first: Tensor) -> tuple[Tensor, Tensor]:
         """How far each ray runs to the skin [world units], -1 for a miss; least distance met."""
-        voxel = self.solid.voxel
+        voxel, device = self.solid.voxel, self.solid.occupancy.device
+        field, origin, start, forward, first = (
+            x.to(device) for x in (self.field, self.origin, self.start, self.forward, first)
+        )
         hit = torch.full_like(first, -1.0, dtype=torch.float64)
         nearest = first.clamp_min(0.0).clone()
         # those on the face have arrived
         live = (first > _HIT).nonzero()[:, 0]
         hit[first <= _HIT] = 0.0
-        gone = torch.zeros(len(live), dtype=torch.float64)
-        reach = float(np.linalg.norm(self.field.shape)) * voxel
+        gone = torch.zeros(len(live), dtype=torch.float64, device=device)
+        reach = float(np.linalg.norm(field.shape)) * voxel
         value = first[live]
         for _ in range(_STEPS):
             if not len(live):
                 break
             # a trilinear, smoothed field overstates distances a little
             gone = gone + (0.8 * value.clamp_min(0.1)).double() * voxel
-            value = self.value(self.start[live] + gone[:, None] * self.forward)
+            value = _at(field, (start[live] + gone[:, None] * forward - origin) / voxel)
             nearest[live] = torch.minimum(nearest[live], value)
             arrived = value <= _HIT
             hit[live[arrived]] = gone[arrived]
             kept = ~arrived & (gone < reach)
             live, gone, value = live[kept], gone[kept], value[kept]
-        return hit, nearest
+        return hit.cpu(), nearest.cpu()
 
     def _face_colors(self, points: Tensor) -> Tensor:
         """Colours of the matter at points [N, 3] of the plane."""
@@ -364,7 +367,7 @@ def _spread(solid: Solid) -> Tensor:
 
 def _at(field: Tensor, place: Tensor) -> Tensor:
     """Trilinear values [N] at positions [N, 3] in voxels; distance is added off the grid."""
-    size = torch.tensor(field.shape, dtype=place.dtype)
+    size = torch.tensor(field.shape, dtype=place.dtype, device=place.device)
     held = torch.minimum(place.clamp_min(0.5), size - 0.5)
     where = (2.0 * held / size - 1.0).flip(-1).to(field)[None, None, None]
     value = functional.grid_sample(
