@@ -50,7 +50,7 @@ class Account:
     Hand it to a simulation as its ``step_hook``.
 
     Attributes:
-        torn: Plastic work of each point under tension [J], float64 [N].
+        torn: Plastic work of each point while all of its stress pulls [J], float64 [N].
         pressed: The same under pressure.
         relaxed: What the spring of each point lost [J].
     """
@@ -88,14 +88,12 @@ class Account:
         volume = dt * after.volume.double()
         law, spring = ((s * rate).sum(dim=1).double() * volume for s in self._stress)
         plastic = law - (held[0] - self._held[0])
-        tension = self._stress[0][:, :3].sum(dim=1) > 0.0
-        self.torn += torch.where(tension, plastic, 0.0)
-        self.pressed += torch.where(tension, 0.0, plastic)
         lost = spring - (held[1] - self._held[1])
-        yielded, pulled, faded = self._yielding(self._last, state, rate=c * dt, law=raw[0], dt=dt)
+        yielded, faded = self._yielding(self._last, state, rate=c * dt, law=raw[0], dt=dt)
         let_go = torch.where(yielded, lost - faded, 0.0)
-        self.torn += torch.where(pulled, let_go, 0.0)
-        self.pressed += torch.where(pulled, 0.0, let_go)
+        tension = (self._stress[0] + self._stress[1])[:, :3].sum(dim=1) > 0.0
+        self.torn += torch.where(tension, plastic + let_go, 0.0)
+        self.pressed += torch.where(tension, 0.0, plastic + let_go)
         self.relaxed += lost - let_go
         self._last, self._held, self._stress = state, held, stress
         return state
@@ -144,7 +142,7 @@ class Account:
 
     def _yielding(
         self, before: State, after: State, *, rate: Tensor, law: Tensor, dt: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         """Springs that the yield surface brought back in a step, and what they relaxed besides.
 
         A spring holds no more than broken matter does (docs/theory/viscous.md): what it loses there
@@ -158,19 +156,15 @@ class Account:
             dt: [s].
 
         Returns:
-            Whether a spring yielded and whether it was in tension, bool [N]; what relaxed of it in
-            the step [J], float64 [N].
+            Whether a spring yielded, bool [N]; what relaxed of it in the step [J], float64 [N].
         """
         assert self.matter is not None
         p, q = before.particles, after.particles
         if p.viscous is None or q.viscous is None:
             none = torch.zeros_like(p.mass, dtype=torch.float64)
-            return none > 0.0, none > 0.0, none
-        options: dict[str, Any] = {
-            "law": self._elastic,
-            "params": self._plain,
-            "material": p.material,
-        }
+            return none > 0.0, none
+        options: dict[str, Any] = {"law": self._elastic, "params": self._plain}
+        options["material"] = p.material
         old, now = p.viscous[:, :6].contiguous(), q.viscous[:, :6].contiguous()
         y = 0.5 * dt * p.viscous[:, 7:8].clamp(min=0.0)
         half = old / (1.0 + y * (1.0 + 0.5 * y))
@@ -183,7 +177,7 @@ class Account:
         stored = [ops.elastic_energy(e.double(), **options) for e in (old, half, moved, trial)]
         volume = q.viscous[:, 6].double() * q.volume.double()
         faded = volume * (stored[0] - stored[1] + stored[2] - stored[3])
-        return yielded, self._elastic_stress(trial, after)[:, :3].sum(dim=1) > 0.0, faded
+        return yielded, faded
 
 
 def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
