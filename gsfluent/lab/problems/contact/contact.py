@@ -241,17 +241,18 @@ def hertz_axis() -> Iterator[Result]:
         )  # fmt: skip
 
 
-def discs_meet(touch: bool) -> tuple[World, list[float]]:
-    """Two elastic discs of 8 cells' radius in plane strain meet, 0.12 c each; how they end.
+def discs_meet(touch: bool, cells: int = 8) -> tuple[World, list[float]]:
+    """Two elastic discs in plane strain meet, 0.12 c each; how they end.
 
     Args:
         touch: Whether points push each other; else nodes exchange impulses.
+        cells: Their radius.
 
     Returns:
         The world, and over its kinetic energy at the start: that at the end, the least on the way,
-        kinetic and elastic energy at the end, and the most of both.
+        kinetic and elastic energy at the end, the most of both, and what their centres have.
     """
-    dx = 0.025
+    dx = 0.2 / cells
     spacing = dx / 2.0
     parts = [disc((c, c, 0.5 * dx), 0.2, dx, spacing) for c in (0.3, 0.7)]
     push = torch.tensor([0.1, 0.1, 0.0], dtype=torch.float64)
@@ -268,17 +269,21 @@ def discs_meet(touch: bool) -> tuple[World, list[float]]:
 
     world.run(3.0, each=watch)
     moving = world.kinetic() / start
-    return world, [moving, least[0], moving + world.elastic() / start, most[0]]
+    one = torch.arange(len(world.position), device=world.position.device) < len(parts[0])
+    pace = world.momentum(one).double() / world.scene.mass[one].sum()
+    centres = float(pace @ pace) / float(push @ push)  # both alike
+    return world, [moving, least[0], moving + world.elastic() / start, most[0], centres]
 
 
 @problem(tier="slow")
 def colliding_discs() -> list[Result]:
     """Two elastic discs meet and part (Sulsky et al. 1994).
 
-    They meet so fast that they ring afterwards: a tenth of what they have then is elastic, so it
-    is the sum that an elastic impact keeps.
+    They meet so fast that they ring afterwards, so it is the sum of kinetic and elastic energy that
+    an elastic impact keeps: 0.925, 0.960, 0.977 of it at 8, 16, 32 cells a radius. The centres keep
+    0.81, 0.82, 0.82 of theirs; the rest rings.
     """
-    world, (moving, least, kept, most) = discs_meet(touch=True)
+    world, (moving, least, kept, most, centres) = discs_meet(touch=True)
     at_nodes = discs_meet(touch=False)[1][2]
     source = "Sulsky, Chen & Schreyer 1994"
     drift = float(world.momentum().norm()) / (0.1 * float(world.scene.mass.sum()))
@@ -287,6 +292,10 @@ def colliding_discs() -> list[Result]:
             "kinetic and elastic energy after / before", kept, 1.0, tolerance=0.1, source=source,
             note=f"points push; kinetic alone {moving:.3f}, at least {least:.2f} on the way; at "
             f"nodes {at_nodes:.3f}",
+        ),
+        compare(
+            "kinetic energy of the centres after / before", centres, 0.818, tolerance=0.03,
+            source="16 and 32 cells a radius: 0.821 and 0.816", note="what is missing rings",
         ),
         compare(
             "largest energy / first", most, 1.0, tolerance=1e-3, source="energy never rises"
