@@ -40,7 +40,7 @@ SIZES = {
     "preview": DemoSize(26, 128, 300, 8_000, 64, "preview", (320, 240), 0.9, 15.0),
 }
 SCENES: dict[str, dict[str, Any]] = {
-    "watermelon": {"material": "fruit.watermelon", "height": 1.5},
+    "watermelon": {"material": "fruit.watermelon", "height": 2.0},
     "orange": {"material": "fruit.orange", "height": 1.0},
 }
 
