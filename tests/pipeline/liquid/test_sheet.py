@@ -103,7 +103,7 @@ def test_clumps_come_apart_and_their_middle_stays() -> None:
 
 
 def test_a_thin_sheet_tears_in_air_and_not_on_a_solid() -> None:
-    points = film(1.6, seed=3)
+    points = film(1.8, seed=3)
     free = torch.ones(len(points), dtype=torch.bool)
 
     def bare(place: Tensor) -> float:
