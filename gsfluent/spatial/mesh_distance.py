@@ -41,7 +41,8 @@ def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:
     """Read a mesh and measure the distance to it on a grid with a margin of three nodes.
 
     Distances within :data:`BAND` are exact to the nearest of the triangles around the twelve
-    nearest surface samples, others right to half a spacing; inside or outside is decided by counting the crossings of vertical lines.
+    nearest surface samples, others right to half a spacing; inside or outside is decided by
+    counting the crossings of vertical lines.
 
     Args:
         path: Any file that trimesh reads.
