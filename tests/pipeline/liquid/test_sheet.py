@@ -153,6 +153,6 @@ def test_what_lies_on_the_floor_or_a_solid_is_not_in_air() -> None:
 def test_drops_have_sizes_of_their_own() -> None:
     sizes = _drops(torch.ones(20000))
     assert torch.equal(sizes[:50], _drops(torch.ones(50)))  # for good, whatever comes later
-    assert float(sizes.min()) >= 0.35 and float(sizes.max()) <= 1.6
+    assert float(sizes.min()) > 0.3 and float(sizes.max()) < 1.7
     assert float(sizes.pow(3).mean()) == pytest.approx(1.0, abs=0.05)
     assert float(sizes.std()) > 0.2
