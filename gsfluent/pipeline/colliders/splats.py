@@ -5,11 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.data import SPRAY, SURFACE, Gaussians, Particles
 from gsfluent.geometry import matrix_to_quaternion
 from gsfluent.pipeline.colliders.patches import FINEST, Patches, rectangle
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.liquid.sheet import CLOSED, TENSION, ellipsoids
+from gsfluent.pipeline.liquid.sheet import SPRAY as SPRAY_SIZE
 from gsfluent.pipeline.liquid.tearing import in_air
 from gsfluent.scene.scene import Scene
 
@@ -17,6 +19,7 @@ _STEEL = (0.40, 0.41, 0.43)
 _OPAQUE = 0.95
 _ALONE = 0.75
 """Size of a drop without neighbours over that of a point of a liquid, up to which it is one."""
+_SMALLEST, _LARGEST = 0.35, 1.6  # drops, over the size of their mean volume
 _BLADE = (0.55, 0.57, 0.60)
 _PLATE_HEIGHT = 0.16
 """Of the plate that stands for a blade, in widths."""
@@ -52,16 +55,30 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
             edge = float(volume.double().mean()) ** (1.0 / 3.0)
             free = in_air(position, solid, edge, scene.floor)
             drawn = ellipsoids(position, volume, free)
-            made = _splats(drawn.means, drawn.scales, paint)
+            size = CLOSED * volume.pow(1.0 / 3.0)
+            lone = (_ALONE - drawn.scales[:, 0] / size).clamp(0.0, _ALONE - SPRAY_SIZE)
+            sizes = torch.lerp(torch.ones_like(size), _drops(size), lone / (_ALONE - SPRAY_SIZE))
+            made = _splats(drawn.means, drawn.scales * sizes[:, None], paint)
             share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
             opacities = torch.full_like(made.opacities, share)
-            alone = drawn.scales[:, 0] < _ALONE * CLOSED * volume.pow(1.0 / 3.0)
-            mist = alone & (volume < TENSION**3)
+            mist = (lone > 0.0) & (volume < TENSION**3)
             labels = torch.where(mist, SPRAY, SURFACE).to(torch.int32)
             groups.append(made.replace(quats=drawn.quats, opacities=opacities, labels=labels))
         else:
             groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None
+
+
+def _drops(like: Tensor) -> Tensor:
+    """Sizes of drops over that of their mean volume, each its own for good.
+
+    What tears into drops of one size by its points does not in life: volumes are exponentially
+    distributed, the simplest of the laws that a ligament's drops obey (Villermaux 2007).
+    """
+    number = torch.arange(like.shape[0], device=like.device)
+    share = 0.5 + 0.5 * ops.hashes(number, [0])[:, 0]
+    volume = -torch.log(share.clamp(min=1e-9))
+    return volume.pow(1.0 / 3.0).clamp(_SMALLEST, _LARGEST).to(like)
 
 
 def bare_points(particles: Particles, scene: Scene) -> Tensor:

@@ -10,6 +10,6 @@ __getattr__, __dir__, __all__ = room(
     looks="Liquids",
     nozzle="WAITING pours",
     parts="LiquidParts",
-    sheet="CLOSED TENSION ellipsoids",
+    sheet="CLOSED SPRAY TENSION ellipsoids",
     tearing="in_air",
 )

@@ -17,7 +17,7 @@ from gsfluent.spatial.neighbours import nearest_rows
 
 WETS = 4.0
 """Distance from a solid or the floor within which a sheet lies on it [spacings]."""
-THIN = (0.45, 0.85)
+THIN = (0.35, 0.6)
 """Thickness up to which a sheet surely tears, and from which on it holds, in :data:`SHEET` or in
 spacings, whichever are more."""
 SHEET = 1e-3

@@ -67,7 +67,7 @@ SCENES = {
     "bread_torn": Scene("bread torn", "bread", (0.02, 0.2, 0.5, 0.98)),
     "cake_cut": Scene("cake cut by a blade", "cake", (0.12, 0.36, 0.56, 0.98)),
     "milk_poured": Scene("milk poured", "orange", (0.12, 0.35, 0.6, 0.98)),
-    "water_splash": Scene("water splash", "orange", (0.1, 0.25, 0.45, 0.7)),
+    "water_splash": Scene("water splash", "orange", (0.1, 0.4, 0.6, 0.82)),
     "melons_collided": Scene("two bodies collided", "melons", (0.02, 0.2, 0.45, 0.98)),
     "glass_dropped": Scene("glass dropped", "pane", (0.14, 0.3, 0.55, 0.98)),
     "egg_dropped": Scene("egg dropped", "egg", (0.05, 0.2, 0.45, 0.98)),

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.geometry import covariance, quaternion_to_matrix
+from gsfluent.pipeline.colliders.splats import _drops
 from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, TORN, ellipsoids
 from gsfluent.pipeline.liquid.spacing import apart
 from gsfluent.pipeline.liquid.tearing import WETS, in_air
@@ -103,7 +104,7 @@ def test_clumps_come_apart_and_their_middle_stays() -> None:
 
 
 def test_a_thin_sheet_tears_in_air_and_not_on_a_solid() -> None:
-    points = film(1.6, seed=3)
+    points = film(1.8, seed=3)
     free = torch.ones(len(points), dtype=torch.bool)
 
     def bare(place: Tensor) -> float:
@@ -147,3 +148,11 @@ def test_what_lies_on_the_floor_or_a_solid_is_not_in_air() -> None:
     assert torch.equal(in_air(points, nothing, H, 0.0), height > WETS * H)
     solid = points.new_tensor([[0.0, 0.0, 10.1 * H]])
     assert torch.equal(in_air(points, solid, H, None), (height - 10.1 * H).abs() > WETS * H)
+
+
+def test_drops_have_sizes_of_their_own() -> None:
+    sizes = _drops(torch.ones(20000))
+    assert torch.equal(sizes[:50], _drops(torch.ones(50)))  # for good, whatever comes later
+    assert float(sizes.min()) > 0.3 and float(sizes.max()) < 1.7
+    assert float(sizes.pow(3).mean()) == pytest.approx(1.0, abs=0.05)
+    assert float(sizes.std()) > 0.2
