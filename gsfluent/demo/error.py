@@ -12,6 +12,7 @@ from gsfluent.data import SURFACE, Solid
 from gsfluent.demo.objects import DemoObject
 from gsfluent.demo.truth import grid_points
 from gsfluent.errors import InputError
+from gsfluent.geometry import ascending
 from gsfluent.spatial.neighbours import nearest_rows
 
 _PATCH = 7
@@ -111,7 +112,7 @@ def _distances(
     offset = torch.zeros(bins, 3).index_add_(0, slot, mine - theirs) / count[:, None]
     filled = torch.bincount(slot, minlength=bins) > 0
     profile = offset[filled].norm(dim=1).mean()
-    histogram = (mine.sort(0).values - theirs.sort(0).values).abs().mean()
+    histogram = (ascending(mine) - ascending(theirs)).abs().mean()
     return {
         "profile": round(float(profile), 4),
         "histogram": round(float(histogram), 4),
@@ -140,6 +141,6 @@ def _patch_distance(given: Tensor, true: Tensor, index: Tensor, planes: int, see
     if min(len(side) for side in sides) == 0:
         return float("nan")
     sorted_sides = [
-        (side @ directions).sort(0).values[row] for side, row in zip(sides, rows, strict=True)
+        ascending(side @ directions)[row] for side, row in zip(sides, rows, strict=True)
     ]
     return float((sorted_sides[0] - sorted_sides[1]).abs().mean()) / _PATCH

@@ -7,19 +7,19 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from gsfluent.errors import InputError
 from gsfluent.spatial.mesh_file import load_mesh
+from gsfluent.spatial.neighbours import nearest
 from gsfluent.spatial.voxels import distance_transform
 
 _log = logging.getLogger(__name__)
 
 MAX_VALUES = 256
 """Most values of a grid along one axis."""
-BAND = 8.0
-"""Spacings from the surface of a collider within which distances to it are exact: four cells of the
-solver, more than contact looks at. A tree of samples takes minutes for what is far from many."""
 _LEAST = 1e-5  # spacings
+_NEAR = 4.0  # spacings up to which samples are as fine as the grid; at twice that, half as fine
 _NEIGHBOURS = 12
 """Triangles looked at for each grid node, nearest sample first."""
 
@@ -40,8 +40,9 @@ class MeshBody:
 def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:
     """Read a mesh and measure the distance to it on a grid with a margin of three nodes.
 
-    Distances within :data:`BAND` are exact to the nearest of the triangles around the twelve
-    nearest surface samples, others right to half a spacing; inside or outside is decided by
+    Distances are exact to the nearest of the triangles around the twelve nearest surface samples,
+    which are less than a spacing apart for what is up to four spacings away, less than two for
+    what is up to eight, and so on: far away to a few hundredths. Inside or outside is decided by
     counting the crossings of vertical lines.
 
     Args:
@@ -72,7 +73,7 @@ def mesh_body(path: str | Path, scale: float, spacing: float) -> MeshBody:
     spacing = max(spacing, float((high - low).max()) / (MAX_VALUES - 8))
     size = np.ceil((high - low) / spacing).astype(int) + 7
     corner = 0.5 * (low + high) - 0.5 * (size - 1) * spacing
-    values = signed_distances(triangles, corner, spacing, size, BAND)
+    values = signed_distances(triangles, corner, spacing, size)
     _log.info("%s: %d triangles, %s distances %.3g m apart", path, len(triangles), size, spacing)
     return MeshBody(values, spacing, corner, center, axes, float(mesh.volume), moments)
 
@@ -92,18 +93,23 @@ def signed_distances(
         spacing: Distance between nodes.
         size: Number of nodes along each axis [3].
         band: Distance in spacings up to which it is exact; farther off that to the nearest node
-            on the other side is taken, half a spacing more or less. None: exact everywhere.
+            on the other side is taken, half a spacing more or less. None: farther off to a
+            few hundredths.
     """
     grid = [corner[i] + spacing * np.arange(size[i]) for i in range(3)]
     nodes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
     inside = grid_winding(triangles, grid) != 0
+    away = np.maximum(distance_transform(~inside), distance_transform(inside))
+    steps = np.maximum(away - 0.5, 0.0).reshape(-1).astype(np.float64)
+    distance = steps * spacing
     if band is None:
-        distance = _distance(nodes, triangles, spacing)
+        # from afar the surface is told as well by samples that lie farther apart
+        level = np.ceil(np.log2(np.maximum(steps, 1.0) / _NEAR)).clip(min=0.0)
+        for far in np.unique(level):
+            rows = level == far
+            distance[rows] = _distance(nodes[rows], triangles, spacing * 2.0**far)
     else:
-        away = np.maximum(distance_transform(~inside), distance_transform(inside))
-        steps = np.maximum(away - 0.5, 0.0).reshape(-1).astype(np.float64)
         near = steps <= band
-        distance = steps * spacing
         distance[near] = _distance(nodes[near], triangles, spacing)
     distance = np.maximum(distance, _LEAST * spacing)  # a node on the surface has a side as well
     signed = np.where(inside.reshape(-1), -distance, distance).reshape(tuple(size))
@@ -112,20 +118,16 @@ def signed_distances(
 
 def _distance(nodes: np.ndarray, triangles: np.ndarray, spacing: float) -> np.ndarray:
     """Distance of every node from the nearest triangle, [N]."""
-    from scipy.spatial import cKDTree
-
     samples, owner = _samples(triangles, 0.7 * spacing)
-    tree = cKDTree(samples)
-    result = np.empty(len(nodes))
+    where = torch.from_numpy(samples)
+    result = np.full(len(nodes), np.inf)
     count = min(_NEIGHBOURS, len(samples))
     for begin in range(0, len(nodes), 65536):
-        part = nodes[begin : begin + 65536]
-        _, index = tree.query(part, k=count)
-        index = index.reshape(len(part), count)
-        best = np.full(len(part), np.inf)
-        for k in range(count):
-            best = np.minimum(best, _point_triangle(part, triangles[owner[index[:, k]]]))
-        result[begin : begin + 65536] = best
+        part, best = nodes[begin : begin + 65536], result[begin : begin + 65536]
+        found = owner[nearest(where, part, count, 2.0 * spacing)[1]]
+        for k in range(count):  # most neighbours lie on triangles that have been looked at
+            new = np.nonzero((found[:, k, None] != found[:, :k]).all(axis=1))[0]
+            best[new] = np.minimum(best[new], _point_triangle(part[new], triangles[found[new, k]]))
     return result
 
 

@@ -103,6 +103,23 @@ class Web:
         total = torch.zeros_like(self.may_break, dtype=torch.int64)
         return total.index_add_(0, self.body, self.amount)
 
+    @functools.cached_property
+    def spaced(self) -> Tensor:
+        """Mean distance between the points of each point's body [m], float64 [N]."""
+        return self.spacing[self.body]
+
+    @functools.cached_property
+    def size(self) -> Tensor:
+        """Points of each body, int64 [bodies]."""
+        return torch.bincount(self.body, minlength=self.may_break.shape[0])
+
+    @functools.cached_property
+    def whole(self) -> Tensor:
+        """First row of each point's body, int64 [N]."""
+        rows = torch.arange(self.body.shape[0], device=self.body.device)
+        first = torch.full_like(self.may_break, len(rows), dtype=torch.int64)
+        return first.scatter_reduce(0, self.body, rows, "amin")[self.body]
+
     def check(self) -> None:
         """Raise a ValueError where a shape does not match or a link names no point."""
         links, count = self.links, self.rest.shape[0]
@@ -170,24 +187,19 @@ def find_pieces(
     """
     _check(web, position, broken, cut_links)
     body, count = web.body, web.body.shape[0]
-    device = body.device
     a, b = web.links.unbind(dim=1)
     if sides is not None:
         cut_links = cut_links | (cut_apart(sides[a], sides[b]) & web.fixed)
     cut, cost, ends = ops.link_costs(
-        web.links, web.length, web.spacing[body], position.double(), broken, web.flowing,
+        web.links, web.length, web.spaced, position.double(), broken, web.flowing,
         web.may_break[body], cut_links, gone, open=OPEN, torn=TORN, steep=_STEEP, unit=_COST,
         shift=_RANKS,
     )  # fmt: skip
 
-    bodies = web.may_break.shape[0]
-    rows = torch.arange(count, device=device)
-    first = torch.full((bodies,), count, device=device).scatter_reduce(0, body, rows, "amin")
-    size = torch.bincount(body, minlength=bodies)
-    hurt = torch.zeros(bodies, dtype=torch.bool, device=device)
+    unit, size = web.whole, web.size
+    hurt = torch.zeros_like(web.may_break)
     hurt[body[(broken | ends).nonzero()[:, 0]]] = True
     split = hurt & web.may_break
-    unit = first[body]
     if not bool(split.any()):
         labels = torch.where(web.flowing, DEBRIS, unit)
         none = torch.zeros_like(broken)
@@ -199,7 +211,7 @@ def find_pieces(
     enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
     fresh = (whole if ever is None else whole & ~ever).nonzero()[:, 0]
     seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
-    name = rows.new_full((count,), count).scatter_reduce(0, root[fresh], fresh, "amin")
+    name = root.new_full((count,), count).scatter_reduce(0, root[fresh], fresh, "amin")
     unit = torch.where(seed, name[root], torch.where(here, DEBRIS, unit))
     unit = _nearest_seed(web, unit, seed, here & ~seed, cost)
 

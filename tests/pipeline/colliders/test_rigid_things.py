@@ -21,7 +21,7 @@ from gsfluent.pipeline.simulate.engine import SolverOptions
 from gsfluent.pipeline.simulate.run import Run
 from gsfluent.pipeline.simulate.stage import Simulate
 from gsfluent.scene.scene import Scene
-from gsfluent.spatial.mesh_distance import mesh_body
+from gsfluent.spatial.mesh_distance import _point_triangle, mesh_body, signed_distances
 from gsfluent.stages.simulate import saved
 
 SOFT = materials.elastic.override(young_modulus=2e4)
@@ -72,6 +72,26 @@ def test_mesh_distances_are_those_of_the_shape(mesh_file: Path) -> None:
     q = np.abs(file_frame) - 0.5 * edges
     exact = np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
     assert np.abs(body.values - exact).max() < 1e-6
+
+
+def test_distances_far_from_a_mesh_are_those_of_its_nearest_triangle() -> None:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    triangles, spacing = np.asarray(ball.triangles), 0.17
+    size, corner = np.array([24, 23, 22]), np.array([-2.0, -1.9, -1.8])
+    values = np.abs(signed_distances(triangles, corner, spacing, size))
+    axes = [corner[i] + spacing * np.arange(size[i]) for i in range(3)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    exact = np.full(len(nodes), np.inf)
+    for triangle in triangles:  # every one of them
+        each = np.broadcast_to(triangle, (len(nodes), 3, 3))
+        exact = np.minimum(exact, _point_triangle(nodes, each))
+    beyond = values.reshape(-1) - exact
+    far = exact > 5.0 * spacing
+    assert far.sum() > 1000
+    assert np.abs(beyond[exact < 4.0 * spacing]).max() < 1e-6
+    assert beyond.min() > -1e-6 and beyond[far].max() < 0.15 * spacing
 
 
 def test_open_meshes_and_other_files_are_refused(mesh_file: Path, tmp_path: Path) -> None:
