@@ -288,20 +288,20 @@ def paths_table(steps: int = 4000) -> str:
 def page_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: every fall."""
     head = (
-        "from m", "cells", "lost J", "relaxed", "broken matter, torn", "broken matter, pressed",
-        "whole matter", "points and nodes, floor", "broken", "crushed", "pieces over 1 %",
-        "torn / (A G_c)",
+        "from m", "cells", "device", "lost J", "relaxed", "broken matter, torn",
+        "broken matter, pressed", "whole matter", "points and nodes, floor", "broken", "crushed",
+        "pieces over 1 %", "torn / (A G_c)",
     )  # fmt: skip
     energy = float(materials.get(MELON.material).fracture_energy or 0.0)
     out = []
-    for r in sorted(rows, key=lambda r: (r["height"], r["cells"], r["seed"])):
+    for r in sorted(rows, key=lambda r: (r["height"], r["cells"], r["device"], r["seed"])):
         parts = [r[k] for k in ("relaxed", "torn", "pressed", "yielded")]
         parts.append(r["dissipated"] - sum(parts))
         area = r["broken_volume"] / (2.0 * r["dx"])
         whole = 4.0 / 3.0 * torch.pi * float(torch.tensor(MELON.half).prod())
         out.append(
             [
-                f"{r['height']:g}", str(r["cells"]), f"{r['dissipated']:.1f}",
+                f"{r['height']:g}", str(r["cells"]), r["device"], f"{r['dissipated']:.1f}",
                 *(f"{100.0 * part / r['dissipated']:.1f} %" for part in parts),
                 *(f"{100.0 * r[k] / whole:.1f} %" for k in ("broken_volume", "crushed_volume")),
                 str(r["pieces_over_1_percent"]),
@@ -333,11 +333,11 @@ def main(argv: list[str] | None = None) -> int:
     if args.paths:
         put("fracture resolution paths", paths_table())
         return 0
-    done = {(r["height"], r["cells"], r["seed"]) for r in read(args.out)}
+    done = {(r["height"], r["cells"], r["seed"], r["device"]) for r in read(args.out)}
     for cells in args.cells:
         for height in args.heights:
             for seed in range(args.seeds):
-                if (height, cells, seed) in done:
+                if (height, cells, seed, args.device) in done:
                     continue
                 row = study(dataclasses.replace(MELON, height=height), cells, seed, args.device)
                 sys.stderr.write(f"{json.dumps(row)}\n")
