@@ -148,9 +148,13 @@ def test_sampled_mass_is_density_times_volume():
 
 def test_a_body_that_lasts_may_have_its_own_inertia():
     solid = ellipsoid((0.1, 0.03, 0.03))
-    for material, changes in ((materials.elastic, True), (materials.fruit.watermelon, False)):
+    for material, temperature, changes in (
+        (materials.elastic, None, True),
+        (materials.elastic, 20.0, False),
+        (materials.fruit.watermelon, None, False),
+    ):
         scene = Scene(floor=None)
-        scene.add(solid, material)
+        scene.add(solid, material, temperature=temperature)
         plain, own = (build_matter(scene, 0.012, inertia=wanted) for wanted in (False, True))
         a, b = plain.particles.mass, own.particles.mass
         assert torch.equal(plain.rest, own.rest)

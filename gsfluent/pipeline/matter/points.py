@@ -179,7 +179,8 @@ def build_matter(
         jitter: Relative half-width of the noise on ``alpha0``.
         device: Device of the result.
         max_particles: Refuse more than this.
-        inertia: Give bodies of :data:`LASTING` laws their own moments of inertia on the grid.
+        inertia: Give bodies of :data:`LASTING` laws without a temperature their own moments of
+            inertia on the grid.
 
     Raises:
         InputError: No body, too many points, or nothing inside a solid.
@@ -217,9 +218,8 @@ def build_matter(
         noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
         params, law, alpha, viscous = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
-        if inertia and bool(
-            torch.isin(law, law.new_tensor([materials.LAWS[n] for n in LASTING])).all()
-        ):
+        lasts = torch.isin(law, law.new_tensor([materials.LAWS[n] for n in LASTING])).all()
+        if inertia and bool(lasts) and body.temperature is None:  # what melts flows
             each = torch.full((count,), volume / count, dtype=torch.float64)
             place = points * body.frame.scale
             mass = mass * ops.inertial_shares(place, volume=each, dx=dx)

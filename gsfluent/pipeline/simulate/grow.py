@@ -59,7 +59,10 @@ def grow(run: Run, scene: Scene, *, seed: int = 0) -> None:
     if fresh:
         alone = copy_of(scene)
         alone.bodies = list(fresh)
-        more = build_matter(alone, matter.dx, seed=seed, device=matter.particles.device)
+        more = build_matter(
+            alone, matter.dx, seed=seed, device=matter.particles.device,
+            inertia=run.stepper.options.inertia,
+        )  # fmt: skip
         if matter.particles.deformation is None:
             more = dataclasses.replace(more, particles=more.particles.replace(deformation=None))
         matter = _joined(matter, more)

@@ -178,9 +178,9 @@ def test_what_rests_sleeps() -> None:
     on, off = (
         Ran(resting(False), fps=10, seconds=2.0, sleep=flag, dx=DX) for flag in (True, False)
     )
-    assert on.report["naps"] == 1 and on.skipped["sleeping_fraction"] > 0.2
+    assert on.report["naps"] == 1 and on.skipped["sleeping_fraction"] > 0.1
     assert off.report["naps"] == 0 == off.skipped["sleeping_fraction"]
-    assert on.report["substeps"] < 0.8 * off.report["substeps"]
+    assert on.report["substeps"] < 0.9 * off.report["substeps"]
     weight = float(on.frames[0].particles.mass.sum()) * 9.81
     assert on.report["frozen_motion"] < 1e-4 * weight * 0.04
     assert_same(on, off, place=0.02, energy=0.01, momentum=0.02)
@@ -193,7 +193,7 @@ def test_what_sleeps_wakes_when_something_comes() -> None:
     lower = on.frames[0].particles.body == 0
     pushed = on.frames[-1].particles.velocity[lower].norm(dim=1).mean()
     assert float(pushed) > 0.1  # it felt the blow
-    assert_same(on, off, place=0.2, energy=0.02, momentum=0.02)
+    assert_same(on, off, place=0.25, energy=0.02, momentum=0.02)
 
 
 # --- blocks ---

@@ -26,7 +26,7 @@ def pressed() -> Scene:
 @pytest.mark.parametrize(
     ("make", "fps", "seconds", "stop", "off_grid"),
     [
-        (lambda: resting(True), 10, 2.0, 15, "asleep"),
+        (lambda: resting(True), 10, 2.0, 17, "asleep"),
         (near_miss, 40, 0.3, 8, "flying"),
         (near_miss, 40, 0.1, 0, "first flight"),
         (pressed, 20, 0.5, 4, "nothing"),
