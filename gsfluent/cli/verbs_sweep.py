@@ -156,6 +156,8 @@ class Fit(Verb):
     """Films of masks: a folder for each camera, named as its image, with a picture per frame."""
     cameras: Path | None = None
     """Of --masks: COLMAP model or transforms.json in the frame of the splats; they stand still."""
+    colors: bool = False
+    """Of --masks: pictures are opaque where the object is, and its colours count at the end."""
     pieces: Path | None = None
     """The pieces of what broke: a table with a column mass [kg], and perhaps x, y, z [m]."""
     dust: float | None = None
@@ -217,8 +219,8 @@ class Fit(Verb):
             return fit_to(
                 shot, self.out, self.learn, device=self.torch_device(), reporter=report,
                 laws=[law.strip() for law in (self.laws or "").split(",") if law.strip()],
-                **self.given("points", "clouds", "force", "masks", "cameras", "sigma", "fps"),
-                **self.given("starts", "cells", "grids", "jobs", "on", "seed"),
+                **self.given("points", "clouds", "force", "masks", "cameras", "colors", "sigma"),
+                **self.given("fps", "starts", "cells", "grids", "jobs", "on", "seed"),
             )  # fmt: skip
 
     def text(self, result: dict[str, Any]) -> str | None:

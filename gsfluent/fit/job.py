@@ -49,6 +49,7 @@ def fit_to(
     force: Path | None = None,
     masks: Path | None = None,
     cameras: Path | None = None,
+    colors: bool = False,
     sigma: float | None = None,
     fps: float | None = None,
     starts: int = 4,
@@ -73,6 +74,7 @@ def fit_to(
         masks: films of masks, with
         cameras: their cameras (see :func:`gsfluent.fit.read.read_masks`), in the frame of the
             splats of the first object, where it is in frame 0.
+        colors: Of masks: their pictures have the object's colours, which count at the end.
         sigma: Standard deviation of what was seen [m, N, none].
         fps: Frames per second of files without times.
         starts: How many, see :class:`gsfluent.pipeline.Fit`.
@@ -108,12 +110,16 @@ def fit_to(
     scene, _ = shot_scene(
         shot, out, device=torch.device(device), seed=seed, reporter=reporter, make=True
     )
+    if colors and kind != "masks":
+        raise InputError("fit: --colors belongs to --masks", "leave it out")
     digests = [content_digest(path)]
     if cameras is not None:
         frame = body_frame(scene.bodies[0], scene)
-        target = read_masks(path, cameras, frame, sigma=sigma, fps=fps)
+        target = read_masks(path, cameras, frame, sigma=sigma, fps=fps, colors=colors)
         digests.append(content_digest(cameras))
-    base = fingerprint(shot.resolved(), list(learn), list(laws), kind, *digests, sigma, fps, seed)
+    base = fingerprint(
+        shot.resolved(), list(learn), list(laws), kind, *digests, sigma, fps, seed, colors
+    )
     runner = functools.partial(_through_sweep, out / "search", base, jobs, on)
     stage = Fit(
         list(learn), laws=laws, starts=starts, cells=cells, grids=grids, seed=seed, runner=runner,

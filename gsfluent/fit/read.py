@@ -12,7 +12,7 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.io.capture import load_poses
 from gsfluent.io.checked.files import read_text
-from gsfluent.io.images import IMAGE_SUFFIXES, read_mask
+from gsfluent.io.images import IMAGE_SUFFIXES, read_array, read_mask
 from gsfluent.io.sequences import read_clouds, read_sequence
 from gsfluent.targets.force import Force
 from gsfluent.targets.masks import Masks
@@ -55,8 +55,9 @@ def read_target(
 
 
 def read_masks(
-    path: Path, cameras: Path, frame: Frame, *, sigma: float | None, fps: float | None
-) -> Masks:
+    path: Path, cameras: Path, frame: Frame, *, sigma: float | None, fps: float | None,
+    colors: bool = False,
+) -> Masks:  # fmt: skip
     """Read films of masks from posed cameras that stand still.
 
     Args:
@@ -67,6 +68,7 @@ def read_masks(
         frame: From the world of the cameras to the scene.
         sigma: Standard deviation of a pixel.
         fps: Frames per second; 24 when None.
+        colors: Pictures are opaque where the object is, and have its colours.
 
     Raises:
         InputError: A film without a camera, films of unlike length or size, or a lens that bends.
@@ -82,19 +84,28 @@ def read_masks(
     used = [posed[film.name] for film in films]
     if any(any(camera.distortion) for camera in used):
         raise InputError(f"{cameras}: the lenses bend", "undistort the films and their cameras")
-    seen = []
+    seen, painted = [], []
     for film in films:
         files = sorted(p for p in film.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
         pictures = [read_mask(file) for file in files]
         if len({picture.shape for picture in pictures}) != 1:
             raise InputError(f"{film}: no pictures, or of several sizes", "one size for a film")
         seen.append(np.stack(pictures))
+        if colors:
+            arrays = [read_array(file) for file in files]
+            if any(array.shape[2] != 4 for array in arrays):
+                raise InputError(
+                    f"{film}: --colors needs pictures with transparency",
+                    "PNG, opaque where the object is; or leave out --colors",
+                )
+            painted.append(np.stack([array[..., :3] for array in arrays]))
     if len({film.shape for film in seen}) != 1:
         shapes = ", ".join(f"{f.name} {list(s.shape)}" for f, s in zip(films, seen, strict=True))
         raise InputError(f"{path}: films are unlike: {shapes}", "as many frames of one size each")
     more: dict[str, Any] = {} if sigma is None else {"sigma": sigma}
     moved = [camera.transformed(frame) for camera in used]
-    return Masks(moved, np.stack(seen), fps=fps or FPS, **more)
+    paint = np.stack(painted) if painted else None
+    return Masks(moved, np.stack(seen), colors=paint, fps=fps or FPS, **more)
 
 
 def _table(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Silhouettes of films: what of each picture is the object."""
+"""Silhouettes of films, what of each picture is the object, and at the end its colours."""
 
 from __future__ import annotations
 
@@ -28,12 +28,17 @@ class Masks:
     """Masks of films from posed cameras that stand still.
 
     The splats of the scene are moved by its points and drawn; their alpha is compared with the
-    masks on a pyramid of means.
+    masks on a pyramid of means. Colours show what a silhouette does not, as the spin of a ball; but
+    they agree with the wrong stripe, too. So they count once all frames do, when silhouettes have
+    found the way.
 
     Args:
         cameras: C of them, in the scene's metres.
         masks: [C, T, H, W] in 0..1: 1 is the object; NaN where nothing is known.
+        colors: What the cameras saw, [C, T, H, W, 3] in 0..1, or None. What is no object does not
+            matter.
         sigma: Standard deviation of a pixel of the pyramid.
+        sigma_color: Likewise of its colours: what light and shade change is among it.
         fps: Frames per second.
         times: Of the frames [s], instead of ``fps``.
 
@@ -48,7 +53,9 @@ class Masks:
         cameras: Listing[Camera],
         masks: Any,
         *,
+        colors: Any = None,
         sigma: float = 0.02,
+        sigma_color: float = 0.1,
         fps: float = 24.0,
         times: Listing[float] | None = None,
     ) -> None:
@@ -69,6 +76,8 @@ class Masks:
                 )
         self.cameras, self.sigma = list(cameras), positive(where, "sigma", sigma)
         self.times = frame_times(where, seen.shape[1], fps, times)
+        self.sigma_color = positive(where, "sigma_color", sigma_color)
+        self.colors = None if colors is None else _colored(colors, seen)
         self.small = [_shrunk(film[:, None], LEVELS[-1])[:, 0] for film in seen]
 
     def observe(self, setting: Setting) -> _Silhouettes:
@@ -76,8 +85,24 @@ class Masks:
         return _Silhouettes(self, setting)
 
 
+def _colored(colors: Any, masks: Tensor) -> list[Tensor]:
+    """Means of what the object shows before black, [T, 3, h, w] of each camera; NaN as of masks.
+
+    Raises:
+        InputError: Not a colour for each pixel of the masks.
+    """
+    films = torch.as_tensor(np.asarray(colors, np.float32))
+    if films.shape != (*masks.shape, 3):
+        raise InputError(
+            f"targets.Masks: colors must have shape {[*masks.shape, 3]}, got {list(films.shape)}",
+            "the pictures that the masks belong to",
+        )
+    before_black = (masks[..., None] * films).movedim(-1, 2)  # [C, T, 3, H, W]
+    return [_shrunk(film, LEVELS[-1]) for film in before_black]
+
+
 def _shrunk(pictures: Tensor, side: int) -> Tensor:
-    """Means over pixels of pictures [N, 1, H, W], so that the longer side has so many."""
+    """Means over pixels of pictures [N, K, H, W], so that the longer side has so many."""
     height, width = pictures.shape[2:]
     scale = side / max(height, width)
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
@@ -105,22 +130,36 @@ class _Silhouettes:
                 self.splats.quats, self.splats.scales, clamped, turn, rigid=1e-6
             )
             moved = self.splats.replace(means=means.float(), quats=quats, scales=scales)
-            rows = [self._gaps(moved, c, k) for c in range(len(self.target.cameras))]
+            last = frames == len(self.target.times)
+            rows = [self._gaps(moved, c, k, last) for c in range(len(self.target.cameras))]
             parts.append(torch.cat(rows).double())
         return joined(parts, numbers) if parts else (torch.zeros(0), torch.zeros(0).long())
 
-    def _gaps(self, splats: Gaussians, number: int, frame: int) -> Tensor:
+    def _gaps(self, splats: Gaussians, number: int, frame: int, last: bool) -> Tensor:
         """Differences of one picture, on every level, in standard deviations."""
-        camera, seen = self.target.cameras[number], self.target.small[number][frame]
+        target = self.target
+        camera, seen = target.cameras[number], target.small[number][frame]
         height, width = (FINE * s for s in seen.shape)
         K = camera.K.clone()
         K[0] *= width / camera.width
         K[1] *= height / camera.height
-        white = torch.ones(splats.count, 1)
-        drawn = draw_at(splats, camera.viewmat, K, (width, height), colors=white,
-                        antialiased=True).alpha  # fmt: skip
-        alpha = functional.avg_pool2d(drawn.reshape(1, 1, height, width), FINE)[0, 0]
-        known = torch.isfinite(seen)
-        gap = torch.where(known, alpha - seen.nan_to_num(), 0.0)[None, None]
-        levels = [gap if side == LEVELS[-1] else _shrunk(gap, side) for side in LEVELS]
-        return torch.cat([level.reshape(-1) for level in levels]) / self.target.sigma
+        colored = last and target.colors is not None
+        paint = splats.colors() if colored else torch.ones(splats.count, 1)
+        drawn = draw_at(splats, camera.viewmat, K, (width, height), colors=paint,
+                        antialiased=True)  # fmt: skip
+        alpha = functional.avg_pool2d(drawn.alpha.reshape(1, 1, height, width), FINE)
+        rows = _levels(alpha, seen[None, None]) / target.sigma
+        if not colored:
+            return rows
+        assert target.colors is not None
+        image = drawn.image.reshape(1, height, width, 3).permute(0, 3, 1, 2)
+        there = target.colors[number][frame][None]
+        more = _levels(functional.avg_pool2d(image, FINE), there) / target.sigma_color
+        return torch.cat([rows, more])
+
+
+def _levels(drawn: Tensor, seen: Tensor) -> Tensor:
+    """Differences of pictures [1, K, H, W] on every level; none where nothing was seen."""
+    gap = torch.where(torch.isfinite(seen), drawn - seen.nan_to_num(), 0.0)
+    levels = [gap if side == LEVELS[-1] else _shrunk(gap, side) for side in LEVELS]
+    return torch.cat([level.reshape(-1) for level in levels])
