@@ -25,7 +25,7 @@ from torch import Tensor
 from gsfluent.ops import elastic_energy, return_mapping, wave_speed
 from gsfluent.ops.plasticity import LAWS
 from gsfluent.ops.reference import plasticity as reference
-from gsfluent.ops.reference.tensors import det_minus_one, to_matrix, to_sym
+from gsfluent.ops.reference.tensors import det_minus_one, spectral, to_matrix, to_sym
 
 NAMES = list(COLUMNS)
 NEW = [name for name in NAMES if name not in ("elastic", "nacc")]
@@ -319,3 +319,11 @@ def test_dt_is_needed_for_viscosity_and_checked() -> None:
 def test_to_sym_is_the_inverse_of_to_matrix() -> None:
     strain = strained(5, 0.1)
     assert torch.equal(to_sym(to_matrix(strain)), strain)
+
+
+@pytest.mark.cuda
+def test_a_logarithm_of_very_many_strains_is_that_of_the_cpu() -> None:
+    """More at once than cuSOLVER can take."""
+    strain = 0.1 * torch.randn(100_000, 6, generator=torch.Generator().manual_seed(0)).double()
+    found = spectral(strain.cuda(), "log").cpu()
+    torch.testing.assert_close(found, spectral(strain, "log"), atol=1e-12, rtol=0)

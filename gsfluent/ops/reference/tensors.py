@@ -82,6 +82,18 @@ def deviator(sym: Tensor) -> Tensor:
     return sym - diagonal(sym[:, :3].mean(1))
 
 
+_BATCH = 8192
+"""Matrices that cuSOLVER is given at a time: of 85,000 it made an internal error on an H200."""
+
+
+def _eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and vectors of symmetric matrices, [N, 3] and [N, 3, 3]."""
+    if not matrix.is_cuda or matrix.shape[0] <= _BATCH:
+        return tuple(torch.linalg.eigh(matrix))
+    values, vectors = zip(*map(torch.linalg.eigh, matrix.split(_BATCH)), strict=True)
+    return torch.cat(values), torch.cat(vectors)
+
+
 class _Spectral(torch.autograd.Function):
     """f(m) of symmetric matrices, with the derivative of Daletskii and Krein.
 
@@ -91,7 +103,7 @@ class _Spectral(torch.autograd.Function):
 
     @staticmethod
     def forward(matrix: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
-        x, vectors = torch.linalg.eigh(matrix)
+        x, vectors = _eigh(matrix)
         if kind == "log":  # ln(I + m) / 2
             y = 0.5 * torch.log1p(x.clamp(min=-1.0 + 1e-6))
         elif kind == "sqrt":  # sqrt(I + m) - I

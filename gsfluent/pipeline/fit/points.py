@@ -192,7 +192,7 @@ def run_field(task: FieldTask) -> dict[str, Any]:
         for grid in grids:
             grid.temperature = temperature
         problem.forget()
-        part = (0.5, 1.0) if number == 0 else (1.0,)
+        part = (0.5,) if number == 0 else (1.0,)
         finer = grids[1] if task.grids == 2 else None
         last = temperature == TEMPERATURES[-1]
         found = in_stages(problem, free, finer=finer, shares=part, settle=last, weigh=False)

@@ -3,12 +3,13 @@
 Levenberg 1944, Marquardt 1963; residuals beyond three standard deviations count by their size
 alone (Huber 1964). Bands: the inverse of ``J^T W J`` and the prior where the motion fits to its
 noise, else the jackknife by frames (Tukey 1958), since what the model gets wrong it gets wrong for
-all points of a frame alike.
+all points of a frame alike; or, where that is more, what such a misfit hides when it lasts.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,6 +37,8 @@ ENOUGH = 0.5
 """So little [nats] is no news: it ends a search whose numbers are not the last."""
 UNSURE = 0.25
 """Of what a finer grid changes in a frame, the part that is not believed."""
+CHANCE = 3.0
+"""Deviations that a correlation of noise stays below."""
 TELLING, QUIET = 30, 0.05
 """Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
 CORRECTIONS = 4
@@ -126,6 +129,10 @@ class Problem:
     def forget(self) -> None:
         """Keep no run: the same coordinates move otherwise from now on."""
         self._last = None
+
+    def begin(self) -> None:
+        """Begin a search, which does not hang on those before."""
+        self._dt = None
 
     def motion(self, free: Array, frames: int, dt: float, *, keep: bool = False) -> Motion:
         """Run these coordinates; of a run that is kept only what the grid changes is done anew."""
@@ -260,6 +267,7 @@ def search(
     active = np.ones(len(unknowns), bool) if active is None else active
     rows = np.flatnonzero(active)
     prior = 1.0 / unknowns.spread**2
+    problem.begin()
     free, damping, runs = start.copy(), DAMPING[0], problem.forward.runs
     for round_ in range(rounds + 1):
         at = linearise(problem, free, frames, rows)
@@ -407,17 +415,41 @@ def _covariance(
 ) -> Array:  # fmt: skip
     """Covariance of the free coordinates; see the head of the file."""
     bread = np.linalg.inv((jacobian * weight[:, None]).T @ jacobian + np.diag(prior[rows]))
-    without = []
+    without, whole = [], np.linalg.inv(bread)
+    one_pattern = np.zeros(len(rows))
     for k in np.unique(frame):
-        part = jacobian[frame == k]
-        left = np.linalg.inv(bread) - (part * weight[frame == k, None]).T @ part
-        without.append(np.linalg.solve(left, part.T @ score[frame == k]))
+        here = frame == k
+        part = jacobian[here]
+        left = whole - (part * weight[here, None]).T @ part
+        without.append(np.linalg.solve(left, part.T @ score[here]))
+        one_pattern += np.linalg.norm(bread @ part.T, axis=1) * np.linalg.norm(score[here])
     gone = np.stack(without) - np.mean(without, axis=0)
     jackknife = (len(gone) - 1) / len(gone) * gone.T @ gone
-    ratio = np.sqrt(np.maximum(np.diag(jackknife) / np.diag(bread), 1.0))
-    whole = np.diag(1.0 / prior)
-    whole[np.ix_(rows, rows)] = bread * ratio[:, None] * ratio[None, :]
-    return whole
+    alike = lasting(score, frame) * one_pattern**2
+    noise = np.diag(bread)
+    ratio = np.sqrt(np.maximum(np.maximum(np.diag(jackknife), alike) / noise, 1.0))
+    found = np.diag(1.0 / prior)
+    found[np.ix_(rows, rows)] = bread * ratio[:, None] * ratio[None, :]
+    return found
+
+
+def lasting(residual: Array, frame: NDArray[np.int64]) -> float:
+    """Correlation of residuals with those of the frame before: 0 of noise, near 1 of a wrong model.
+
+    What a residual has in all frames is left out: points that were seen wrong in frame 0 are so in
+    every other. Frames with unlike numbers of residuals do not tell, nor does a correlation that
+    noise has by chance.
+    """
+    parts = [residual[frame == k] for k in np.unique(frame)]
+    if len(parts) < 3 or len({len(part) for part in parts}) != 1:
+        return 0.0
+    each = np.stack(parts)
+    each = each - each.mean(axis=0)
+    size = float(np.linalg.norm(each[1:]) * np.linalg.norm(each[:-1]))
+    if size == 0.0:
+        return 0.0
+    chance = CHANCE / math.sqrt(each[1:].size)
+    return max(0.0, float((each[1:] * each[:-1]).sum()) / size - chance)
 
 
 def contact_frame(problem: Problem, free: Array) -> int:

@@ -205,11 +205,12 @@ def errors_of(found: Found, true: dict[str, float], velocity: np.ndarray) -> lis
 
 
 def record(
-    kind: str, number: int, cells: int, kept: Path | None = None, device: str = "cpu"
-) -> dict[str, Any]:
+    kind: str, number: int, cells: int, kept: Path | None = None, device: str = "cpu",
+    truth: str = "cpu",
+) -> dict[str, Any]:  # fmt: skip
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
-    return fitted(shown(kind, number, cells, device), kept, device)
+    return fitted(shown(kind, number, cells, truth), kept, device)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,8 +268,9 @@ def fitted(made: Shown, kept: Path | None, device: str) -> dict[str, Any]:
 
 
 def beside(
-    kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, path: Path
-) -> list[dict[str, Any]]:
+    kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, truth: str,
+    path: Path,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Scenes of one matter, whose fits wait for each other; each is added to a file at its end."""
     torch.set_num_threads(1)
 
@@ -283,7 +285,7 @@ def beside(
         return row
 
     begun = clock.perf_counter()
-    made = [shown(kind, number, cells, device) for number in numbers]
+    made = [shown(kind, number, cells, truth) for number in numbers]
     middle = clock.perf_counter()
     rows = [row for row in together(one, made) if row is not None]
     print(f"{kind}: {len(rows)} scenes, truth {middle - begun:.1f} s, fits "
@@ -390,6 +392,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=8, help="along the thing, coarser grid")
     parser.add_argument("--only", nargs="*", default=list(KINDS), choices=list(KINDS))
     parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
+    parser.add_argument("--truth", choices=["cpu", "cuda"], help="its device; that of the fit")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--beside", type=int, default=1, help="scenes whose fits are one run")
     parser.add_argument(
@@ -405,18 +408,19 @@ def main() -> None:
     records = read(path)
     done = {(r["kind"], r["scene"]) for r in records}
     kept, device, cells = options.keep, options.device, options.cells
+    truth, size = options.truth or device, options.beside
     slow_first = [k for k in reversed(KINDS) if k in options.only]
-    if options.beside > 1:
+    if size > 1:
         groups = [
-            (k, some[i : i + options.beside], cells, kept, device, path)
+            (k, left, cells, kept, device, truth, path)
+            for i in range(0, options.scenes, size)
             for k in slow_first
-            if (some := [n for n in range(options.scenes) if (k, n) not in done])
-            for i in range(0, len(some), options.beside)
+            if (left := [n for n in range(i, min(i + size, options.scenes)) if (k, n) not in done])
         ]
         in_pool(beside, groups, path, options.jobs, options.minutes)
     else:
         wanted = [(k, n) for n in range(options.scenes) for k in slow_first if (k, n) not in done]
-        tasks = [(k, n, cells, kept, device) for k, n in wanted]
+        tasks = [(k, n, cells, kept, device, truth) for k, n in wanted]
         in_pool(record, tasks, path, options.jobs, options.minutes)
     records = read(path)
     if records:

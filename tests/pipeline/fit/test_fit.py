@@ -18,7 +18,7 @@ from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
-from gsfluent.pipeline.fit.solve import Problem, in_stages, linearise, search
+from gsfluent.pipeline.fit.solve import Problem, _covariance, in_stages, lasting, linearise, search
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
 from gsfluent.targets import Clouds, Force, Masks, Points
 from gsfluent.targets.target import Followers
@@ -279,3 +279,25 @@ def test_runs_side_by_side_are_those_one_by_one(
     size = float(np.abs(before.jacobian).max())
     assert float(np.abs(after.jacobian - before.jacobian).max()) < 1e-4 * size
     assert forward.runs - runs == 5  # its middle is known
+
+
+def test_a_misfit_that_lasts_widens_the_bands_and_noise_does_not() -> None:
+    """A millimetre too far in every frame of contact hides in a number; as much noise does not."""
+    random = np.random.default_rng(0)
+    frame = np.repeat(np.arange(8), 60)
+    way = random.standard_normal(60)
+    jacobian = np.concatenate([(k + 1) * way for k in range(8)])[:, None]
+    pattern = random.standard_normal(60)
+    lasts = np.concatenate([np.sin(0.4 * k) * pattern for k in range(8)])
+    noise = random.standard_normal(480)
+    still = np.tile(pattern, 8)  # a point that was seen wrong in frame 0
+    assert lasting(lasts, frame) > 0.3
+    assert lasting(noise, frame) == 0.0 and lasting(still + 0.1 * noise, frame) == 0.0
+    assert lasting(noise[1:], frame[1:]) == 0.0
+    one, rows = np.ones(480), np.arange(1)
+    sd = [
+        float(np.sqrt(_covariance(jacobian, r, one, frame, np.ones(1), rows)[0, 0]))
+        for r in (noise, lasts)
+    ]
+    exact = 1.0 / np.sqrt(float((jacobian**2).sum()) + 1.0)
+    assert sd[0] < 2.0 * exact and sd[1] > 5.0 * exact
