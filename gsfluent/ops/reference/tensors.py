@@ -10,6 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+EIGEN_BATCH = 2**14
+"""Matrices of which eigenvalues are asked at once."""
+
 
 def to_matrix(sym: Tensor) -> Tensor:
     """[N, 6] (xx, yy, zz, xy, xz, yz) to [N, 3, 3]."""
@@ -82,6 +85,14 @@ def deviator(sym: Tensor) -> Tensor:
     return sym - diagonal(sym[:, :3].mean(1))
 
 
+def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Eigenvalues and vectors of [N, 3, 3]; of 1e5 at once cuSOLVER fails."""
+    if len(matrix) <= EIGEN_BATCH:
+        return torch.linalg.eigh(matrix)
+    parts = [torch.linalg.eigh(part) for part in matrix.split(EIGEN_BATCH)]
+    return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
+
+
 class _Spectral(torch.autograd.Function):
     """f(m) of symmetric matrices, with the derivative of Daletskii and Krein.
 
@@ -91,7 +102,7 @@ class _Spectral(torch.autograd.Function):
 
     @staticmethod
     def forward(matrix: Tensor, kind: str) -> tuple[Tensor, Tensor, Tensor]:
-        x, vectors = torch.linalg.eigh(matrix)
+        x, vectors = _eigen(matrix)
         if kind == "log":  # ln(I + m) / 2
             y = 0.5 * torch.log1p(x.clamp(min=-1.0 + 1e-6))
         elif kind == "sqrt":  # sqrt(I + m) - I
