@@ -70,7 +70,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
     "hysteresis": ("pressed", "both", "unloading"),
-    "split": ("volumetric", "none", "spectral"),
+    "split": ("volumetric", "none", "spectral", "rankine"),
     "model": ("at1", "at2"),
 }
 """What of a material is a word, and which words there are."""

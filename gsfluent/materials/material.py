@@ -133,7 +133,8 @@ class Material:
             keeps the strength, and a crack takes more energy than it should.
         split: phase_field: what drives a crack. ``volumetric``: shear and opening (Amor et al.);
             ``none``: all that is stored, for tension alone; ``spectral``: principal extensions
-            (Miehe et al.), for matter in compression.
+            (Miehe et al.), for matter in compression; ``rankine``: the largest tensile stress,
+            for bodies that fall, which landing must not crush.
         model: phase_field: ``at1`` is elastic up to its strength, ``at2`` softens from the start.
         softening: How many times softer than the real thing ``young_modulus`` is, for the sake of
             the time step. Strengths are divided by its root: the speed at which it breaks and the

@@ -27,7 +27,7 @@ STEP = 0.04
 """Steps of the logarithm of strength in which it varies from place to place."""
 SIZE = {"at1": 3.0 / 8.0, "at2": 27.0 / 256.0}
 """l is this times ``E Gc / strength^2``."""
-SPLITS = {"volumetric": 0, "none": 1, "spectral": 2}
+SPLITS = {"volumetric": 0, "none": 1, "spectral": 2, "rankine": 3}
 MODELS = {"at1": 0, "at2": 4}
 """Their sum is the column ``shear_damage`` of a row."""
 

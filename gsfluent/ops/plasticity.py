@@ -291,7 +291,7 @@ def return_mapping(
             yeoh: C20 and C30 [Pa] in columns 2 and 3; ogden: alpha_1, mu_2 [Pa], alpha_2, mu_3
             [Pa] in columns 2 to 5, alpha_3 in column 7. phase_field: columns 2 to 5 are the
             threshold psi_t [J/m^3], the damage d, the length l [m], and split (0 volumetric, 1
-            none, 2 spectral) plus 4 for AT2.
+            none, 2 spectral, 3 rankine) plus 4 for AT2.
         material: int32 [N], row of ``law`` and ``params`` per particle. None: row 0 for all if
             M = 1, row i for particle i if M = N.
         k: Exponent of the dynamic centre; 2 is GaussianFluent's, infinity the fixed centre of

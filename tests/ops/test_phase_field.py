@@ -77,7 +77,7 @@ def test_what_is_intact_is_elastic_and_a_pressed_crack_carries_all(split: str) -
     strain = strained(500, 0.02)
     alpha = torch.full((500,), -1.0, dtype=torch.float64)
     whole = ops.return_mapping(strain, alpha, still(500), law=LAW, params=row(0.0, split))[2]
-    if split != "spectral":
+    if split not in ("spectral", "rankine"):
         elastic = torch.tensor([LAWS["elastic"]], dtype=torch.int32)
         plain = ops.return_mapping(strain, alpha, still(500), law=elastic, params=row())[2]
         assert (whole - plain).abs().max() < 1e-12 * KAPPA
@@ -115,6 +115,21 @@ def test_the_history_only_grows_and_is_in_units_of_the_threshold() -> None:
     assert (minus >= 0).all() and (plus >= 0).all()
     _, second, _, _ = ops.return_mapping(0.5 * strain, first, still(300), **given)
     assert torch.equal(second, first)
+
+
+def test_only_tensile_stress_drives_by_rankine() -> None:
+    """Strains of bars pulled and pressed along x, which give way across."""
+    poisson = (3.0 * KAPPA - 2.0 * MU) / (6.0 * KAPPA + 2.0 * MU)
+    young = 2.0 * MU * (1.0 + poisson)
+    log_v = 0.01 * torch.tensor([[1.0, -poisson, -poisson], [-1.0, poisson, poisson]])
+    strain = torch.cat([torch.expm1(2.0 * log_v.double()), torch.zeros(2, 3).double()], dim=1)
+    alpha = torch.full((2,), -1.0, dtype=torch.float64)
+    drive = {
+        split: ops.return_mapping(strain, alpha, still(2), law=LAW, params=row(0.0, split))[1] + 1.0
+        for split in ("rankine", "spectral")
+    }
+    assert float(drive["rankine"][0]) == pytest.approx(0.5 * young * 1e-4 / 500.0, rel=1e-6)
+    assert float(drive["rankine"][1]) < 1e-9 < 0.1 * float(drive["spectral"][1])
 
 
 def test_broken_matter_forgets_what_it_has_opened() -> None:
@@ -163,10 +178,12 @@ def test_core_of_one_point(split: str) -> None:
     )
     got = core.float64.return_mapping(strain, -1.0, still(1)[0].numpy(), 9, m)
     g = (1.0 - 1e-4) * 0.49 + 1e-4
-    if split == "spectral":
+    if split in ("spectral", "rankine"):
         h = math.log(stretch)
-        energy = (MU + 0.5 * (KAPPA - 2.0 / 3.0 * MU)) * h * h
-        pull = g * (KAPPA + 4.0 / 3.0 * MU) * h
+        whole = (KAPPA + 4.0 / 3.0 * MU) * h
+        young = 9.0 * KAPPA * MU / (3.0 * KAPPA + MU)
+        energy = 0.5 * whole * h if split == "spectral" else 0.5 * whole**2 / young
+        pull = g * whole
     else:
         shear = stretch ** (-2.0 / 3.0) * (stretch**2 + 2.0) - 3.0
         energy = 0.5 * MU * shear
@@ -201,7 +218,7 @@ def test_gradient_of_one_point(split: str) -> None:
 
 @pytest.mark.parametrize(
     ("column", "value", "what"),
-    [(2, 0.0, "threshold"), (3, 1.5, "damage"), (4, 0.0, "length"), (5, 3.0, "split")],
+    [(2, 0.0, "threshold"), (3, 1.5, "damage"), (4, 0.0, "length"), (5, 8.0, "split")],
 )
 def test_rows_that_are_none_are_refused(column: int, value: float, what: str) -> None:
     params = row()

@@ -18,7 +18,12 @@ pytestmark = [
 ]
 DT = 2e-4
 NAMES = ("position", "velocity", "strain", "alpha", "peak")
-MODELS = [("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False)]
+MODELS = [
+    ("at1", "none", False),
+    ("at1", "volumetric", True),
+    ("at2", "spectral", False),
+    ("at1", "rankine", False),
+]
 
 
 def error(have: Tensor, want: Tensor) -> float:

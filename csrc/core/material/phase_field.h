@@ -29,11 +29,20 @@ constexpr bool isochoric_is(double isochoric, double j2m1) {
 static_assert(isochoric_is(kBrokenIsochoric, kBrokenVolumeMax));
 
 // Column `damage` of a row: split, and 4 for AT2.
-enum EnergySplit : int { kSplitVolumetric = 0, kSplitNone = 1, kSplitSpectral = 2 };
+enum EnergySplit : int {
+  kSplitVolumetric = 0,
+  kSplitNone = 1,
+  kSplitSpectral = 2,
+  kSplitRankine = 3  // as kSplitSpectral, but the largest tensile stress drives
+};
 inline constexpr int kModelAt2 = 4;
 template <typename T>
 GSF_HOST_DEVICE int split_of(const MaterialRow<T>& m) {
   return int(m.damage) & 3;
+}
+template <typename T>
+GSF_HOST_DEVICE bool is_principal(const MaterialRow<T>& m) {
+  return split_of(m) >= kSplitSpectral;
 }
 template <typename T>
 GSF_HOST_DEVICE bool is_at2(const MaterialRow<T>& m) {
@@ -111,7 +120,8 @@ GSF_HOST_DEVICE PhaseState<T> phase_state(T mu, T kappa, T damage, T all, const 
           add_diagonal(g * mu * d, T(0.5) * kappa * (g * counted + (T(1) - all) * pressed))};
 }
 
-// Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2.
+// Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2. kSplitRankine
+// has <largest principal stress of the whole>^2 / 2E in the place of psi+ as what drives.
 template <typename T>
 GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m, const Sym3<T>& e) {
   using std::log1p;
@@ -142,10 +152,13 @@ GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m,
   const T g = T(1.0 - kResidualStiffness) * whole * whole + T(kResidualStiffness);
   const T lambda = m.kappa - T(2.0 / 3.0) * m.mu;
   const T log_j = h[0] + h[1] + h[2], open = max(log_j, T(0)), pressed = min(log_j, T(0));
-  const T squares = up[0] * up[0] + up[1] * up[1] + up[2] * up[2];
   const Sym3<T> stress = T(2) * m.mu * ((g - T(1)) * plus + log_v);
-  return {m.mu * squares + T(0.5) * lambda * open * open,
-          add_diagonal(stress, lambda * (g * open + pressed))};
+  const T pull = max(lambda * log_j + T(2) * m.mu * h[0], T(0));
+  const T young = T(9) * m.kappa * m.mu / (T(3) * m.kappa + m.mu);
+  const T squares = up[0] * up[0] + up[1] * up[1] + up[2] * up[2];
+  const T active = split_of(m) == kSplitRankine ? T(0.5) * pull * pull / young
+                                                : m.mu * squares + T(0.5) * lambda * open * open;
+  return {active, add_diagonal(stress, lambda * (g * open + pressed))};
 }
 
 template <typename T>
@@ -180,7 +193,7 @@ GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym
   LawResult<T> out{s.e, s.e, alpha, false, s.guarded};
   if (m.cohesion >= T(kBrokenDamage)) {
     if (s.j2m1 > T(kBrokenVolumeMax)) {
-      if (split_of(m) == kSplitSpectral) {
+      if (is_principal(m)) {
         // Or the other principal strains would be pressed as these are let go, and make energy.
         // Squared: d is no logarithm, and falls more slowly than one.
         const T kept = T(kBrokenLogMax) / log1p(s.j2m1);
@@ -198,7 +211,7 @@ GSF_HOST_DEVICE_COLD LawResult<T> phase_field(const MaterialRow<T>& m, const Sym
   }
   if (s.guarded || out.plastic) out.strain = strain_from_isochoric(s.d, log_volume(s));
   PhaseState<T> now;
-  if (split_of(m) == kSplitSpectral) {
+  if (is_principal(m)) {
     now = phase_state_spectral(m, out.strain);
   } else {
     const T shift = s.n < T(0.5) ? unit_det_shift_small(s.d) : unit_det_shift(s.d);

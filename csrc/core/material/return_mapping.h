@@ -93,7 +93,7 @@ GSF_HOST_DEVICE ReturnMapped<T> field_mapping(const Sym3<T>& strain, T alpha,
                                               const Mat3<T>& increment, int law,
                                               const MaterialRow<T>& m, const NaccOptions<T>& o,
                                               T dt) {
-  if (law == kPhaseField && split_of(m) != kSplitSpectral) {
+  if (law == kPhaseField && !is_principal(m)) {
     const Sym3<T> e = update_strain(strain, increment);
     ReturnMapped<T> out{e, e, alpha, false, false, false, false};
     if (finite(e) && finite(alpha) && det_identity_plus(increment) > T(0) &&

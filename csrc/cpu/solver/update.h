@@ -115,7 +115,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const P peak = packet.load1(s.peak);
       damage = clamp(peak + P(kBrokenDamage), P(0), P(1));
       history = packet.load1(s.alpha);
-      // without a spectral split, and what the series hold
+      // without a split of principal strains, and what the series hold
       const P split =
           pack_of<T>([&](int lane) { return T(int(s.rows[row_of(lane) * kRowColumns + 5]) & 3); });
       const Int broken = phase & (damage >= P(kBrokenDamage));

@@ -19,11 +19,17 @@ namespace {
 // Threads of a CTA, of which each multiprocessor runs one: half of its registers are left to p2g.
 constexpr int kDamageThreads = 512, kDamageShare = 2;
 
-// Sums of a window in shared memory. There the GPU adds 32 bits at once, but 64 in a loop: in
-// float, whose units leave 41 bits to a point (ops/solver_state.py), each sum has two words of 21
-// bits and what is above. They have room for so many points.
-constexpr int kLowBits = 21, kChunk = 1 << (32 - kLowBits);
+// Sums of a window in shared memory. There the GPU adds 32 bits at once, but 64 in a loop. In
+// float, whose units leave 41 bits to a point (ops/solver_state.py), each sum has two words. The
+// history, whose range is wide, goes into both, 21 bits and what is above. Else one word takes what
+// is below 2^28 units, rounded to 2^7, and the other what is more, rounded to 2^18: an addend is
+// off by 2^-11 of itself at most, and mostly by far less. The words have room for so many points of
+// at most 0.43 of 41 bits.
+constexpr int kLowBits = 21, kSmallBits = 28, kSmallDropped = 7, kDropped = 18, kChunk = 1 << 10;
 constexpr double kWhole = 4503599627370496.0;  // 2^52: what is added to it is rounded to a whole
+__device__ inline uint64_t whole_of(double v) {
+  return static_cast<uint64_t>(__double_as_longlong(v + kWhole)) & ((uint64_t(1) << 52) - 1);
+}
 template <typename T>
 struct DamageTile {
   unsigned low[kDamageSums][kTile], high[kDamageSums][kTile];
@@ -32,14 +38,22 @@ struct DamageTile {
       (&low[0][0])[i] = (&high[0][0])[i] = 0;
   }
   __device__ void add(int c, int at, double v) {
-    const uint64_t bits = static_cast<uint64_t>(__double_as_longlong(v + kWhole));
-    const unsigned below = static_cast<unsigned>(bits) & ((1u << kLowBits) - 1u);
-    const unsigned above = static_cast<unsigned>(bits >> kLowBits) & ((1u << (52 - kLowBits)) - 1u);
-    if (below != 0) atomicAdd(&low[c][at], below);
-    if (above != 0) atomicAdd(&high[c][at], above);
+    if (c == kDriveSum) {
+      const uint64_t units = whole_of(v);
+      const unsigned below = static_cast<unsigned>(units) & ((1u << kLowBits) - 1u);
+      const unsigned above = static_cast<unsigned>(units >> kLowBits);
+      if (below != 0) atomicAdd(&low[c][at], below);
+      if (above != 0) atomicAdd(&high[c][at], above);
+      return;
+    }
+    const bool small = v < double(1 << kSmallBits);
+    const double per_unit = small ? 1.0 / double(1 << kSmallDropped) : 1.0 / double(1 << kDropped);
+    atomicAdd(small ? &low[c][at] : &high[c][at], static_cast<unsigned>(whole_of(v * per_unit)));
   }
   __device__ long long sum(int c, int at) const {
-    return (static_cast<long long>(high[c][at]) << kLowBits) + static_cast<long long>(low[c][at]);
+    const long long below = low[c][at], above = high[c][at];
+    if (c == kDriveSum) return (above << kLowBits) + below;
+    return (above << kDropped) + (below << kSmallDropped);
   }
 };
 template <>
@@ -256,6 +270,50 @@ struct Solve {
     }
   }
 
+  // prepare and all sweeps where there is a thread for every node: it keeps its equation, and only
+  // values go through memory. The same sums in the same order.
+  __device__ void solve_held(const cooperative_groups::grid_group& all) const {
+    const bool at2 = s.damage_scale[kScaleAt2] != 0.0;
+    const double empty = s.damage_scale[kScaleEmpty];
+    const double volume_unit = s.damage_scale[kVolumeSum], stiff_unit = s.damage_scale[kStiffSum];
+    const bool mine = thread < int64_t(s.damage_counts[kActiveCount]) * kBlockNodes;
+    const int local = static_cast<int>(thread % kBlockNodes);
+    double weight[6] = {}, right = 0.0, inverse = 0.0, value = 0.0;
+    const double* near[6] = {};
+    double* own = nullptr;
+    if (mine) {
+      const int32_t slot = plane(kActiveList)[thread / kBlockNodes];
+      const int64_t* units = s.damage_sums + kDamageSums * (int64_t(slot) * kBlockNodes + local);
+      double sums[kDamageSums];
+      for (int c = 0; c < kDamageSums; ++c) sums[c] = double(units[c]) * s.damage_scale[c];
+      own = &nodes(slot)[local].value;
+      const DamageNode node = damage_node(sums, at2, empty, [&](int f) {
+        bool inside;
+        const int there = face_node(local, f, inside);
+        const int32_t other = beyond(slot, f, inside);
+        near[f] = own;
+        if (other < 0) return other == kUndamaged ? sums[kStiffSum] : 0.0;
+        const int64_t* far = s.damage_sums + kDamageSums * (int64_t(other) * kBlockNodes + there);
+        if (!(double(far[kVolumeSum]) * volume_unit > empty)) return 0.0;
+        near[f] = &nodes(other)[there].value;
+        return weight[f] = edge_weight(sums[kStiffSum], double(far[kStiffSum]) * stiff_unit);
+      });
+      value = node.value;
+      right = node.right;
+      inverse = node.inverse;
+      *own = value;
+    }
+    const int colour = node_colour(local);
+    for (int half = 0; half < 2 * kSweeps; ++half) {
+      all.sync();
+      if (inverse == 0.0 || colour != half % 2) continue;
+      double sum = right;
+      for (int f = 0; f < 6; ++f) sum += weight[f] * *near[f];
+      value = relaxed(value, sum, inverse);
+      *own = value;
+    }
+  }
+
   // The field back to the points of one home, by a CTA.
   __device__ void gather(int64_t home, T (&tile)[kTile]) const {
     const int32_t* neighbour = s.neighbour + home * kNeighbours;
@@ -310,10 +368,14 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageShare)
   const int64_t homes = s.damage_counts[kHomeCount];
   for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) solve.scatter(s.damage_homes[i], sums);
   all.sync();
-  solve.prepare();
-  for (int half = 0; half < 2 * kSweeps; ++half) {
-    all.sync();
-    solve.relax(half % 2);
+  if (int64_t(s.damage_counts[kActiveCount]) * kBlockNodes <= solve.threads) {
+    solve.solve_held(all);
+  } else {
+    solve.prepare();
+    for (int half = 0; half < 2 * kSweeps; ++half) {
+      all.sync();
+      solve.relax(half % 2);
+    }
   }
   all.sync();
   if (solve.thread == 0) s.damage_counts[kActiveCount] = 0;

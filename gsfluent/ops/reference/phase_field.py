@@ -16,6 +16,7 @@ from gsfluent.materials.phase_field import C0, SPLITS
 from gsfluent.ops.reference.laws import Returned
 from gsfluent.ops.reference.nacc import Material
 from gsfluent.ops.reference.tensors import (
+    EIGEN_BATCH,
     det_minus_one,
     deviator,
     diagonal,
@@ -55,7 +56,7 @@ def bounded(d: Tensor, n: Tensor, j2m1: Tensor, m: Material) -> tuple[Tensor, Te
     far = broken & (j2m1 > VOLUME_MAX)
     # with a split by principal strains the others would be pressed as these are let go; squared
     # since d, which is no logarithm, falls more slowly than one
-    principal = far & ((m.shear_damage.detach().long() & 3) == SPLITS["spectral"])
+    principal = far & ((m.shear_damage.detach().long() & 3) >= SPLITS["spectral"])
     kept = (math.log1p(VOLUME_MAX) / torch.log1p(j2m1.clamp(min=VOLUME_MAX))) ** 2
     kept = torch.where(principal, kept, 1.0)
     d, n = kept[:, None] * d, kept * n
@@ -81,7 +82,7 @@ def _volume(x: Tensor) -> Tensor:
 
 
 def split_energy(strain: Tensor, m: Material) -> tuple[Tensor, Tensor]:
-    """(psi+, psi-) [J/m^3], [N] each; only psi+ drives damage and loses stiffness."""
+    """(psi+, psi-) [J/m^3], [N] each; only psi+ loses stiffness."""
     split = m.shear_damage.detach().long() & 3
     d, j2m1 = _invariants(strain)
     shear = 1.5 * m.mu * unit_det_shift(d)
@@ -89,7 +90,7 @@ def split_energy(strain: Tensor, m: Material) -> tuple[Tensor, Tensor]:
     none = split == SPLITS["none"]
     plus = shear + open_ + torch.where(none, pressed, 0.0)
     minus = torch.where(none, 0.0, pressed)
-    principal = split == SPLITS["spectral"]
+    principal = split >= SPLITS["spectral"]
     if bool(principal.any()):
         up, down, log_j = _principal(strain)
         lame = 0.5 * (m.kappa - 2.0 / 3.0 * m.mu)
@@ -97,6 +98,21 @@ def split_energy(strain: Tensor, m: Material) -> tuple[Tensor, Tensor]:
         plus = torch.where(principal, up + lame * log_j.clamp(min=0) ** 2, plus)
         minus = torch.where(principal, down + lame * log_j.clamp(max=0) ** 2, minus)
     return plus, minus
+
+
+def drive(strain: Tensor, m: Material) -> Tensor:
+    """What drives damage [J/m^3], [N]: psi+, or by ``rankine`` the largest principal stress."""
+    found = split_energy(strain, m)[0]
+    rankine = (m.shear_damage.detach().long() & 3) == SPLITS["rankine"]
+    if bool(rankine.any()):
+        log_v = spectral(strain, "log")
+        largest = torch.cat(
+            [torch.linalg.eigvalsh(m)[:, -1] for m in to_matrix(log_v).split(EIGEN_BATCH)]
+        )
+        pull = (m.kappa - 2.0 / 3.0 * m.mu) * log_v[:, :3].sum(1) + 2.0 * m.mu * largest
+        young = 9.0 * m.kappa * m.mu / (3.0 * m.kappa + m.mu)
+        found = torch.where(rankine, 0.5 * pull.clamp(min=0.0) ** 2 / young, found)
+    return found
 
 
 def _principal(strain: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -118,15 +134,15 @@ def phase_field(
     open_, pressed = j2m1.clamp(min=0.0), j2m1.clamp(max=0.0)
     pull = torch.where(split == SPLITS["none"], g * (open_ + pressed), g * open_ + pressed)
     stress = (g * m.mu)[:, None] * d + diagonal(0.5 * m.kappa * pull)
-    principal = split == SPLITS["spectral"]
+    principal = split >= SPLITS["spectral"]
     if bool(principal.any()):
         up, down, log_j = _principal(strain)
         lame = m.kappa - 2.0 / 3.0 * m.mu
         own = 2.0 * m.mu[:, None] * (g[:, None] * up + down)
         own = own + diagonal(lame * (g * log_j.clamp(min=0.0) + log_j.clamp(max=0.0)))
         stress = torch.where(principal[:, None], own, stress)
-    drive = split_energy(strain, m)[0] / m.friction.clamp(min=1e-30)
-    alpha = torch.maximum(alpha, drive.clamp(max=DRIVE_MAX) - 1.0)
+    now = drive(strain, m) / m.friction.clamp(min=1e-30)
+    alpha = torch.maximum(alpha, now.clamp(max=DRIVE_MAX) - 1.0)
     return Returned(strain, alpha, stress, forgets, guarded)
 
 

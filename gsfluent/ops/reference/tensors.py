@@ -82,15 +82,15 @@ def deviator(sym: Tensor) -> Tensor:
     return sym - diagonal(sym[:, :3].mean(1))
 
 
-_BATCH = 8192
+EIGEN_BATCH = 8192
 """Matrices that cuSOLVER is given at a time: of 85,000 it made an internal error on an H200."""
 
 
 def _eigh(matrix: Tensor) -> tuple[Tensor, Tensor]:
     """Eigenvalues and vectors of symmetric matrices, [N, 3] and [N, 3, 3]."""
-    if not matrix.is_cuda or matrix.shape[0] <= _BATCH:
+    if not matrix.is_cuda or matrix.shape[0] <= EIGEN_BATCH:
         return tuple(torch.linalg.eigh(matrix))
-    values, vectors = zip(*map(torch.linalg.eigh, matrix.split(_BATCH)), strict=True)
+    values, vectors = zip(*map(torch.linalg.eigh, matrix.split(EIGEN_BATCH)), strict=True)
     return torch.cat(values), torch.cat(vectors)
 
 

@@ -274,11 +274,12 @@ def jobs(quick: bool, device: str) -> list[Job]:
         )  # fmt: skip
     for name in THROWS:
         add("floor", name, name, 300.0, lambda n=name: floor(n, 4 if quick else 6, device))
-    for height in (0.75,) if quick else (0.4, 0.75):
+    for height in (0.6,) if quick else (0.4, 0.6):
         for count in (20,) if quick else (20, 30, 40):
             for seed in range(1 if quick else 8):
                 add(
-                    "melon", f"{height:g}_{count}_{seed}", f"{height:g} m", (count / 10.0) ** 4,
+                    "melon", f"rankine_{height:g}_{count}_{seed}", f"{height:g} m",
+                    (count / 10.0) ** 4,
                     lambda c=count, s=seed, h=height: melon(c, s, h, device),
                 )  # fmt: skip
     return made

@@ -65,15 +65,20 @@ def turned(angle: float, axis: int) -> Frame:
     return Frame(turn, torch.zeros(3), 1.0)
 
 
+def ware(name: str, law: str) -> materials.Material:
+    """A preset under a law; a phase field keeps the strength, and only tension breaks it."""
+    field = {"prefer": "strength", "split": "rankine"} if law == "phase_field" else {}
+    return materials.get(name).override(law=law, **field)
+
+
 def pane(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float]:
     """A pane of 0.3 m that is thrown down on a corner, and the size of a cell."""
     dx = 0.3 / cells
     half = (0.15, 0.1, 0.5 * walls * dx)
     body = solid(half, lambda x: (x.abs() <= torch.tensor(half)).all(dim=-1), 0.5 * dx)
-    glass = materials.glass.override(law=law)
     scene = Scene()
     lean = Frame(turned(0.5, 1).rotation @ turned(0.4, 0).rotation, torch.zeros(3), 1.0)
-    scene.add(body, glass, frame=lean, velocity=(0.0, 0.0, -speed))
+    scene.add(body, ware("glass", law), frame=lean, velocity=(0.0, 0.0, -speed))
     scene.drop(0.01)
     return scene, dx
 
@@ -89,8 +94,7 @@ def bowl(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float
 
     body = solid((0.08, 0.08, 0.08), inside, 0.5 * dx)
     scene = Scene()
-    ware = materials.ceramic.override(law=law)
-    scene.add(body, ware, frame=turned(0.25, 1), velocity=(0.0, 0.0, -speed))
+    scene.add(body, ware("ceramic", law), frame=turned(0.25, 1), velocity=(0.0, 0.0, -speed))
     scene.drop(0.005)
     return scene, dx
 

@@ -63,8 +63,7 @@ HEADINGS = {
     ),
     "melon": (
         "## A melon on three grids\n\n"
-        "`fruit.watermelon`, its cracks driven by tension alone (`split: spectral`), l 25 mm on "
-        "every grid, eight seeds each."
+        "`fruit.watermelon`, l 25 mm on every grid, `prefer: strength`."
     ),
 }
 """What stands above the tables that the page has not yet."""
@@ -217,19 +216,23 @@ def floor(found: Sequence[Found]) -> str:
 def melon(found: Sequence[Found]) -> str:
     """Pieces of melons over the grid."""
     rows = []
-    for height, cells in sorted({(f["height"], f["cells"]) for f in found}):
-        mine = [f for f in found if (f["height"], f["cells"]) == (height, cells)]
+
+    def of(f: Found) -> tuple[str, float, int]:
+        return f.get("split", "spectral"), f["height"], f["cells"]
+
+    for split, height, cells in sorted({of(f) for f in found}):
+        mine = [f for f in found if of(f) == (split, height, cells)]
         clean = [f for f in mine if f["verdict"] == "clean"]
         pieces = [float(f["pieces"]) for f in clean]
         spread = float(np.std(pieces)) if pieces else math.nan
         rows.append(
             (
-                f"{height:g} m", str(cells), f"{len(clean)} of {len(mine)}",
+                split, f"{height:g} m", str(cells), f"{len(clean)} of {len(mine)}",
                 f"{np.mean(pieces):.1f}" if pieces else "", f"{spread:.1f}",
                 _mean([f["largest"] for f in clean]), _mean([f["broken"] for f in clean]),
             )
         )  # fmt: skip
-    head = ("height", "cells", "clean", "pieces over 3 %", "+-", "largest", "broken")
+    head = ("split", "height", "cells", "clean", "pieces over 3 %", "+-", "largest", "broken")
     return _table(head, rows)
 
 

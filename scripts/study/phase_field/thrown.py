@@ -132,7 +132,7 @@ def melon(cells: int, seed: int, height: float, device: str) -> tuple[dict[str, 
     """
     fruit = materials.get("fruit.watermelon")
     ware = fruit.override(
-        law="phase_field", length=MELON_LENGTH, prefer="strength", split="spectral"
+        law="phase_field", length=MELON_LENGTH, prefer="strength", split="rankine"
     )
     trial = dataclasses.replace(MELON, material=ware, height=height)
     dx = 2.0 * max(trial.half) / cells
@@ -142,7 +142,8 @@ def melon(cells: int, seed: int, height: float, device: str) -> tuple[dict[str, 
         last = frame
     shares = last.pieces.mass_fractions
     return {
-        "cells": cells, "seed": seed, "height": height, "points": last.particles.count, "dx": dx,
+        "cells": cells, "seed": seed, "height": height, "split": ware.split,
+        "points": last.particles.count, "dx": dx,
         "steps": steps.report["substeps"], "pieces": int((shares > 0.03).sum()),
         "largest": float(shares[0]) if len(shares) else 0.0,
         "broken": float(last.broken.double().mean()), "verdict": steps.report["verdict"],
