@@ -12,7 +12,7 @@ from gsfluent.pipeline.colliders.patches import FINEST, Patches, rectangle
 from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.liquid.sheet import CLOSED, TENSION, ellipsoids
 from gsfluent.pipeline.liquid.sheet import SPRAY as SPRAY_SIZE
-from gsfluent.pipeline.liquid.tearing import in_air
+from gsfluent.pipeline.liquid.tearing import in_air, tears
 from gsfluent.scene.scene import Scene
 
 _STEEL = (0.40, 0.41, 0.43)
@@ -53,7 +53,8 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
         paint = _PAINT.get(body.material.name.split(".")[-1], _LIQUID if flows else _STEEL)
         if flows:
             edge = float(volume.double().mean()) ** (1.0 / 3.0)
-            free = in_air(position, solid, edge, scene.floor)
+            torn = tears(body.material)
+            free = in_air(position, solid, edge, scene.floor) if torn else None
             drawn = ellipsoids(position, volume, free)
             size = CLOSED * volume.pow(1.0 / 3.0)
             lone = (_ALONE - drawn.scales[:, 0] / size).clamp(0.0, _ALONE - SPRAY_SIZE)

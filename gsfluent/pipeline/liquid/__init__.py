@@ -11,5 +11,5 @@ __getattr__, __dir__, __all__ = room(
     nozzle="WAITING pours",
     parts="LiquidParts",
     sheet="CLOSED SPRAY TENSION ellipsoids",
-    tearing="in_air",
+    tearing="in_air tears",
 )

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsfluent.pipeline.liquid.nozzle import held_weights, release_times, waiting
 from gsfluent.pipeline.liquid.spacing import apart
-from gsfluent.pipeline.liquid.tearing import in_air, wetted
+from gsfluent.pipeline.liquid.tearing import in_air, tears, wetted
 from gsfluent.pipeline.liquid.wetting import Skin, held
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.matter.state import State
@@ -37,6 +37,7 @@ class Liquids:
         self._skin = Skin.of(matter, solids) if flowing and solids else None
         self._solids, self._floor = wetted(matter, scene), scene.floor
         self._release = release_times(scene, matter, TICK)
+        self._tears = [tears(body.material) for body in scene.bodies]
         self._active = bool(flowing)
 
     def held(self, first: int = 0) -> list[tuple[float, float]]:
@@ -74,10 +75,12 @@ class Liquids:
         """Points that have run together apart again, torn sheets drawn together, each liquid."""
         position = state.position.clone()
         solid = state.position[self._solids]
-        for (a, b), spacing in zip(self.matter.ranges, self.matter.spacing, strict=True):
+        bodies = zip(self.matter.ranges, self.matter.spacing, self._tears, strict=True)
+        for (a, b), spacing, torn in bodies:
             mine = rows[(rows >= a) & (rows < b)]
             if mine.numel():
                 place = position[mine]
-                position[mine] = apart(place, spacing, in_air(place, solid, spacing, self._floor))
+                free = in_air(place, solid, spacing, self._floor) if torn else None
+                position[mine] = apart(place, spacing, free)
         p = state.particles
         return state._replace(position=position, particles=p.replace(position=position.to(p.dtype)))

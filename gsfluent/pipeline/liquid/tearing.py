@@ -3,7 +3,7 @@
 A sheet in air that is thinner than the points can carry is torn by its surface tension: holes in
 half a millimetre of water grow at sqrt(2 sigma / (rho t)) = 0.5 m/s (Taylor 1959, Culick 1960), two
 spacings between two looks, and leave strands and drops. A film on a solid or on the floor wets it,
-and stays.
+and stays; so does one of milk, whose proteins hold its surface, and of what is thicker.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsfluent.materials import Material
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.scene.scene import Scene
 from gsfluent.spatial.neighbours import nearest_rows
@@ -27,6 +28,15 @@ DROP = 0.75
 """Distance to which points of a torn sheet draw together [spacings]: nearly that inside a drop."""
 GRASP = 3.0
 """Distance within which they do [spacings]."""
+
+CLEAN = 1.5e-3
+"""Viscosity [Pa s] up to which a liquid is taken for one like water: nothing holds its surface."""
+
+
+def tears(material: Material) -> bool:
+    """Whether thin sheets of a liquid tear."""
+    viscosity = material.viscosity
+    return viscosity is None or bool((torch.as_tensor(viscosity) <= CLEAN).all())
 
 
 def in_air(position: Tensor, solid: Tensor, spacing: float, floor: float | None) -> Tensor:

@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from gsfluent import materials
 from gsfluent.geometry import covariance, quaternion_to_matrix
 from gsfluent.pipeline.colliders.splats import _drops
 from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, TORN, ellipsoids
 from gsfluent.pipeline.liquid.spacing import apart
-from gsfluent.pipeline.liquid.tearing import WETS, in_air
+from gsfluent.pipeline.liquid.tearing import WETS, in_air, tears
 from gsfluent.spatial.blue_noise import blue_cylinder
 from gsfluent.spatial.neighbours import nearest_rows
 
@@ -148,6 +149,11 @@ def test_what_lies_on_the_floor_or_a_solid_is_not_in_air() -> None:
     assert torch.equal(in_air(points, nothing, H, 0.0), height > WETS * H)
     solid = points.new_tensor([[0.0, 0.0, 10.1 * H]])
     assert torch.equal(in_air(points, solid, H, None), (height - 10.1 * H).abs() > WETS * H)
+
+
+def test_water_tears_and_what_holds_its_surface_does_not() -> None:
+    assert tears(materials.get("water"))
+    assert not any(tears(materials.get(name)) for name in ("milk", "oil", "honey"))
 
 
 def test_drops_have_sizes_of_their_own() -> None:
