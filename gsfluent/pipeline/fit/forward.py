@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.materials import LAWS, Material
@@ -21,6 +22,7 @@ from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.fit.parameters import OFFSET, VECTORS
 from gsfluent.pipeline.fit.together import MOST_POINTS, Lane, Setup, agreed, moved
 from gsfluent.pipeline.matter.points import (
+    LASTING,
     POINTS_PER_CELL,
     body_frame,
     sample_points,
@@ -107,6 +109,9 @@ class Forward:
             density = torch.tensor([float(m.parameters()[..., 6].mean()) for m in layers])
             volume = torch.full((count,), body.volume / count, dtype=torch.float64)
             mass = volume * density.double()[index]
+            if body.temperature is None and all(m.law in LASTING for m in layers):
+                # as the simulation has it (matter/points.py)
+                mass = mass * ops.inertial_shares(points * body.frame.scale, volume=volume, dx=dx)
             position, velocity, affine = start_of(body, scene, points, mass)
             places.append(position.double())
             velocities.append(velocity.double())

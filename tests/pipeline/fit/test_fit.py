@@ -10,6 +10,7 @@ import pytest
 import torch
 from fit_scenes import SIDE, elastic, scene, seen
 
+from gsfluent import materials
 from gsfluent.data import Camera
 from gsfluent.draw import draw
 from gsfluent.errors import InputError
@@ -20,6 +21,7 @@ from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, _covariance, in_stages, lasting, linearise, search
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
+from gsfluent.pipeline.matter import build_matter
 from gsfluent.targets import Clouds, Force, Masks, Points
 from gsfluent.targets.target import Followers
 
@@ -55,6 +57,19 @@ def test_the_same_bits_twice(tracks: Any) -> None:
     made = problem(Points(tracks), scene(elastic(7e4)), NAMES[:1])
     one, two = (search(made, made.unknowns.start, 5, rounds=2).free for _ in range(2))
     assert np.array_equal(one, two)
+
+
+def test_masses_are_shared_out_as_in_a_simulation() -> None:
+    flows = materials.get("water")
+    for material, even in ((elastic(), False), (flows, True)):
+        thing = scene(material)
+        own = Forward(thing, [0.0, 0.1], DX)._mass
+        wanted = build_matter(thing, DX, inertia=True).particles.mass.double()
+        assert (float(own.std() / own.mean()) < 1e-6) == even
+        for of in (torch.min, torch.max):
+            assert float(of(own) / own.mean()) == pytest.approx(
+                float(of(wanted) / wanted.mean()), abs=0.1
+            )
 
 
 def test_the_motion_is_that_of_the_closed_form_before_contact() -> None:
