@@ -9,15 +9,13 @@ python scripts/study/fit/laws.py --jobs 4 --beside 3 --device cuda  # searches o
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import time as clock
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tracks import DATA, FPS, KINDS, PAGE, SIDE, entered, in_pool, read, scene_of, seen
+from tracks import DATA, FPS, KINDS, PAGE, SIDE, entered, in_pool, noted, read, scene_of, seen
 
 from gsfluent.pipeline.fit.laws import choose_laws
 from gsfluent.pipeline.fit.task import one_by_one
@@ -64,21 +62,10 @@ def judged(made: tuple[int, Scene, np.ndarray], cells: int, device: str) -> dict
 
 
 def beside(numbers: list[int], cells: int, device: str, path: Path) -> list[dict[str, Any]]:
-    """Scenes whose searches wait for each other; each is added to a file at its end."""
+    """Scenes whose searches wait for each other."""
     torch.set_num_threads(1)
-
-    def one(made: tuple[int, Scene, np.ndarray]) -> dict[str, Any] | None:
-        try:
-            row = judged(made, cells, device)
-        except Exception as error:  # the others go on
-            print(f"{made[0]}: {error!r}", file=sys.stderr, flush=True)
-            return None
-        with path.open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps(row) + "\n")
-        return row
-
     made = [shown(number, cells, device) for number in numbers]
-    return [row for row in together(one, made) if row is not None]
+    return noted(lambda one: judged(one, cells, device), made, path)
 
 
 def table(records: list[dict[str, Any]]) -> str:

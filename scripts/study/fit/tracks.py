@@ -267,27 +267,34 @@ def fitted(made: Shown, kept: Path | None, device: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def beside(
-    kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, truth: str,
-    path: Path,
-) -> list[dict[str, Any]]:  # fmt: skip
-    """Scenes of one matter, whose fits wait for each other; each is added to a file at its end."""
-    torch.set_num_threads(1)
+def noted(
+    judge: Callable[[Any], dict[str, Any]], made: list[Any], path: Path
+) -> list[dict[str, Any]]:
+    """What a function makes of scenes beside each other; each is added to a file at its end."""
 
-    def one(made: Shown) -> dict[str, Any] | None:
+    def one(scene: Any) -> dict[str, Any] | None:
         try:
-            row = fitted(made, kept, device)
+            row = judge(scene)
         except Exception as error:  # the others go on
-            print(f"{kind} {made.number}: {error!r}", file=sys.stderr, flush=True)
+            print(f"{scene}: {error!r}"[-500:], file=sys.stderr, flush=True)
             return None
         with path.open("a", encoding="utf-8") as stream:
             stream.write(json.dumps(row) + "\n")
         return row
 
+    return [row for row in together(one, made) if row is not None]
+
+
+def beside(
+    kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, truth: str,
+    path: Path,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Scenes of one matter, whose fits wait for each other."""
+    torch.set_num_threads(1)
     begun = clock.perf_counter()
     made = [shown(kind, number, cells, truth) for number in numbers]
     middle = clock.perf_counter()
-    rows = [row for row in together(one, made) if row is not None]
+    rows = noted(lambda one: fitted(one, kept, device), made, path)
     print(f"{kind}: {len(rows)} scenes, truth {middle - begun:.1f} s, fits "
           f"{clock.perf_counter() - middle:.1f} s", flush=True)  # fmt: skip
     return rows
