@@ -1,12 +1,33 @@
-"""Which processes of this machine are alive, and since when; a name for the running kernel."""
+"""Processes that are alive, and since when; the running kernel; what is done beside the work."""
 
 from __future__ import annotations
 
 import math
 import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _SLACK = 2.0  # [s]: the kernel counts in ticks since a boot that it knows to the second
+
+
+@contextmanager
+def repeated(seconds: float, act: Callable[[], None]) -> Iterator[None]:
+    """Call a function each so many seconds, in a thread, while the block runs."""
+    over = threading.Event()
+
+    def live() -> None:
+        while not over.wait(seconds):
+            act()
+
+    thread = threading.Thread(target=live, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def is_alive(pid: int, since: float) -> bool:

@@ -12,7 +12,7 @@ from gsfluent.data import Frame
 from gsfluent.errors import InputError
 from gsfluent.io.capture import load_poses
 from gsfluent.io.checked.files import read_text
-from gsfluent.io.images import IMAGE_SUFFIXES, read_array, read_mask
+from gsfluent.io.images import IMAGE_SUFFIXES, mask_of, read_array
 from gsfluent.io.sequences import read_clouds, read_sequence
 from gsfluent.targets.force import Force
 from gsfluent.targets.masks import Masks
@@ -87,12 +87,12 @@ def read_masks(
     seen, painted = [], []
     for film in films:
         files = sorted(p for p in film.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
-        pictures = [read_mask(file) for file in files]
+        arrays = [read_array(file) for file in files]
+        pictures = [mask_of(array) for array in arrays]
         if len({picture.shape for picture in pictures}) != 1:
             raise InputError(f"{film}: no pictures, or of several sizes", "one size for a film")
         seen.append(np.stack(pictures))
         if colors:
-            arrays = [read_array(file) for file in files]
             if any(array.shape[2] != 4 for array in arrays):
                 raise InputError(
                     f"{film}: --colors needs pictures with transparency",

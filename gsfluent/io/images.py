@@ -240,8 +240,12 @@ def _fitted(camera: Camera, width: int, height: int) -> Camera:
 
 
 def read_mask(path: Path) -> NDArray[np.float32]:
-    """Read a mask, [H, W]: its alpha channel if that says anything, else its first; 1 is object."""
-    values = read_array(path)
+    """Read a mask, [H, W]; 1 is object."""
+    return mask_of(read_array(path))
+
+
+def mask_of(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mask of a picture [H, W, K]: its alpha channel if that says anything, else its first."""
     if values.shape[2] == 4 and values[..., 3].min() < 1:
         return values[..., 3]
     return values[..., 0]

@@ -11,10 +11,11 @@ import contextlib
 import json
 import sqlite3
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from gsfluent.process import repeated
 
 FOUND = "found.json"
 _MAX_SIDE = 1600  # pixels at which features are sought; more costs time and finds hardly more
@@ -70,20 +71,9 @@ def main(work: Path) -> None:
 @contextlib.contextmanager
 def _told(rows: Callable[[], int], total: int, text: str) -> Any:
     """Says each second how far the work within is."""
-    ended = threading.Event()
-
-    def look() -> None:
-        while not ended.wait(_LOOK):
-            _say(min(rows(), total - 1), total, text)
-
     _say(0, total, text)
-    thread = threading.Thread(target=look, daemon=True)
-    thread.start()
-    try:
+    with repeated(_LOOK, lambda: _say(min(rows(), total - 1), total, text)):
         yield
-    finally:
-        ended.set()
-        thread.join()
     _say(total, total, text)
 
 

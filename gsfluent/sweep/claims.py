@@ -11,14 +11,13 @@ import json
 import os
 import secrets
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from gsfluent.process import boot, is_alive
+from gsfluent.process import boot, is_alive, repeated
 
 BEAT = 10.0
 """Seconds from one sign of life to the next."""
@@ -87,23 +86,14 @@ def claimed(path: Path) -> Iterator[bool]:
             path.unlink(missing_ok=True)
 
 
-@contextmanager
-def beating(beat: Callable[[], None]) -> Iterator[None]:
+def beating(beat: Callable[[], None]) -> AbstractContextManager[None]:
     """Give signs of life while the block runs."""
-    over = threading.Event()
 
-    def live() -> None:
-        while not over.wait(BEAT):
-            with suppress(OSError):
-                beat()
+    def once() -> None:
+        with suppress(OSError):
+            beat()
 
-    thread = threading.Thread(target=live, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    return repeated(BEAT, once)
 
 
 def is_stale(path: Path, now: float) -> bool:

@@ -41,9 +41,6 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
     by the sheet (:mod:`gsfluent.pipeline.liquid.sheet`).
     """
     groups = []
-    stands = [body.solid is not None for body in scene.bodies]
-    wetted = torch.tensor(stands, device=particles.body.device)[particles.body.long()]
-    solid = particles.position[wetted]
     for number, body in enumerate(scene.bodies):
         if body.solid is not None:
             continue
@@ -53,8 +50,10 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
         paint = _PAINT.get(body.material.name.split(".")[-1], _LIQUID if flows else _STEEL)
         if flows:
             edge = float(volume.double().mean()) ** (1.0 / 3.0)
-            torn = tears(body.material)
-            free = in_air(position, solid, edge, scene.floor) if torn else None
+            free = None
+            if tears(body.material):
+                solid = particles.position[_stands(particles, scene)]
+                free = in_air(position, solid, edge, scene.floor)
             drawn = ellipsoids(position, volume, free)
             size = CLOSED * volume.pow(1.0 / 3.0)
             lone = (_ALONE - drawn.scales[:, 0] / size).clamp(0.0, _ALONE - SPRAY_SIZE)
@@ -68,6 +67,12 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
         else:
             groups.append(_splats(position, CLOSED * volume.pow(1.0 / 3.0), paint))
     return Gaussians.cat(groups) if groups else None
+
+
+def _stands(particles: Particles, scene: Scene) -> Tensor:
+    """Points of bodies that have splats of their own, bool [N]."""
+    stands = [body.solid is not None for body in scene.bodies]
+    return torch.tensor(stands, device=particles.body.device)[particles.body.long()]
 
 
 def _drops(like: Tensor) -> Tensor:

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.materials import LAWS, Material
@@ -22,11 +21,11 @@ from gsfluent.pipeline.colliders.rigid import RigidSet
 from gsfluent.pipeline.fit.parameters import OFFSET, VECTORS
 from gsfluent.pipeline.fit.together import MOST_POINTS, Lane, Setup, agreed, moved
 from gsfluent.pipeline.matter.points import (
-    LASTING,
     POINTS_PER_CELL,
     body_frame,
     sample_points,
     select,
+    shared_out,
     start_of,
 )
 from gsfluent.scene.scene import Scene
@@ -109,9 +108,8 @@ class Forward:
             density = torch.tensor([float(m.parameters()[..., 6].mean()) for m in layers])
             volume = torch.full((count,), body.volume / count, dtype=torch.float64)
             mass = volume * density.double()[index]
-            if body.temperature is None and all(m.law in LASTING for m in layers):
-                # as the simulation has it (matter/points.py)
-                mass = mass * ops.inertial_shares(points * body.frame.scale, volume=volume, dx=dx)
+            own = torch.tensor([LAWS[m.law] for m in layers])
+            mass = shared_out(mass, body, points, volume, own, dx)
             position, velocity, affine = start_of(body, scene, points, mass)
             places.append(position.double())
             velocities.append(velocity.double())

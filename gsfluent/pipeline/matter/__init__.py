@@ -13,8 +13,8 @@ __getattr__, __dir__, __all__ = room(
     links="BACK FULL Hanging Links NEIGHBOURS OPEN PARTED",
     pieces="Pieces Web dust_limit find_pieces",
     points=(
-        "ALPHA_JITTER LASTING MAX_PARTICLES Matter POINTS_PER_CELL body_frame build_matter "
-        "grid_spacing sample_points select start_of"
+        "ALPHA_JITTER MAX_PARTICLES Matter POINTS_PER_CELL body_frame build_matter "
+        "grid_spacing sample_points select shared_out start_of"
     ),
     state="State at_rows kinetic_energy load_state save_state",
     weld="seen weld",

@@ -218,11 +218,9 @@ def build_matter(
         noise = jitter * (2.0 * torch.rand(count, generator=generator) - 1.0)
         params, law, alpha, viscous = _parameters(body, points, seed, noise, dx)
         mass = params[:, 6] * (volume / count)
-        lasts = torch.isin(law, law.new_tensor([materials.LAWS[n] for n in LASTING])).all()
-        if inertia and bool(lasts) and body.temperature is None:  # what melts flows
+        if inertia:
             each = torch.full((count,), volume / count, dtype=torch.float64)
-            place = points * body.frame.scale
-            mass = mass * ops.inertial_shares(place, volume=each, dx=dx)
+            mass = shared_out(mass, body, points, each, law, dx)
         position, velocity, affine = start_of(body, scene, points, mass)
         tables.append(params)
         laws.append(law)
@@ -275,6 +273,25 @@ def grid_spacing(scene: Scene, cells: int) -> float:
             "simulate: the scene is empty", hint="scene.add(solid, material=...) first"
         )
     return max(extents)[1] / cells
+
+
+def shared_out(
+    mass: Tensor, body: Body, points: Tensor, volume: Tensor, law: Tensor, dx: float
+) -> Tensor:
+    """Masses by which a body that lasts turns on a grid as it should; of others as they are.
+
+    Args:
+        mass: [kg], [N].
+        body: The body.
+        points: In its own coordinates, [N, 3].
+        volume: [m^3], float64 [N].
+        law: Numbers of its laws.
+        dx: Node spacing [m].
+    """
+    lasts = torch.isin(law, law.new_tensor([materials.LAWS[n] for n in LASTING])).all()
+    if not bool(lasts) or body.temperature is not None:  # what melts flows
+        return mass
+    return mass * ops.inertial_shares(points * body.frame.scale, volume=volume, dx=dx)
 
 
 def _sample_body(body: Body, step: float, seed: int) -> tuple[Tensor, float]:
