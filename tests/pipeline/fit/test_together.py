@@ -20,16 +20,22 @@ TIMES = [k / 24 for k in range(6)]
 CLAY = Material("clay", 1e5, 0.3, 1000.0, law="von_mises", yield_stress=2e3)
 
 
-def test_runs_of_several_searches_are_those_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two laws, other numbers of frames, another speed: one run of the solver."""
-    things = [(scene(elastic(9e4)), 6), (scene(CLAY, velocity=(0.3, 0.0, -1.5)), 4)]
-    calls: list[int] = []
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many lanes each run of the solver has."""
+    made: list[int] = []
 
     def counted(setup: Any, lanes: Any) -> Any:
-        calls.append(len(lanes))
+        made.append(len(lanes))
         return solve(setup, lanes)
 
     monkeypatch.setattr(rooms, "solve", counted)
+    return made
+
+
+def test_runs_of_several_searches_are_those_of_each(calls: list[int]) -> None:
+    """Two laws, other numbers of frames, another speed: one run of the solver."""
+    things = [(scene(elastic(9e4)), 6), (scene(CLAY, velocity=(0.3, 0.0, -1.5)), 4)]
 
     def run(thing: Any) -> Any:
         forward = Forward(thing[0], TIMES, DX)
@@ -105,15 +111,8 @@ def test_fits_side_by_side_find_their_numbers() -> None:
     assert found == pytest.approx([6e4, 2e5], rel=1e-2)
 
 
-def test_searches_within_searches_wait_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_within_searches_wait_for_all(calls: list[int]) -> None:
     """Two scenes, two runs of each: four lanes of one run, then two."""
-    calls: list[int] = []
-
-    def counted(setup: Any, lanes: Any) -> Any:
-        calls.append(len(lanes))
-        return solve(setup, lanes)
-
-    monkeypatch.setattr(rooms, "solve", counted)
 
     def inner(young: float) -> float:
         return float(Forward(scene(elastic(young)), TIMES[:3], DX).run({}, 3, 1e-3).strain)
