@@ -8,8 +8,8 @@
 // Associated flow opens along the principal directions that are pulled, and alpha grows by what
 // has opened, so that whatever the path the loss of all strength takes the integral of f over alpha
 // per initial volume, no more and no less. Shear flows at constant volume and counts as no damage.
-// Past zero alpha is the log volume that opened in broken matter and has to close before it presses
-// (Tampubolon et al. 2017).
+// Past zero alpha is the log volume that opened where broken matter lost all stress, and has to close
+// before it presses again (Tampubolon et al. 2017).
 #pragma once
 
 #include "core/material/nacc.h"
@@ -18,6 +18,9 @@
 namespace gsf {
 
 inline constexpr double kSteepestOpening = 0.98;   // -df/dalpha over kappa that a round counts on
+// A state that was returned is inside, whatever rounding and the last round left.
+template <typename T>
+inline constexpr T kRankineSlack = sizeof(T) == 4 ? T(4e-6) : T(1e-12);
 inline constexpr double kLargestTension = 0.8165;  // largest eigenvalue of d over |d|: sqrt(2/3)
 
 template <typename T>
@@ -105,7 +108,7 @@ template <typename T>
 GSF_HOST_DEVICE bool open_cracks(const NaccMaterial<T>& m, bool softens, NaccState<T>& s) {
   using std::abs;
   using std::log1p;
-  const T slack = sizeof(T) == 4 ? T(1e-6) : T(2e-15);
+  const T slack = kRankineSlack<T>;
   const Vec3<T> found = eigenvalues_jacobi(s.d);
   const T y[3] = {found.x, found.y, found.z};
   const T mean = T(0.5) * m.kappa * s.j2m1;
@@ -154,7 +157,11 @@ GSF_HOST_DEVICE bool open_cracks(const NaccMaterial<T>& m, bool softens, NaccSta
   const Sym3<T> second = square(first) + (y[0] - y[1]) * first;
   s.d = deviator(slope[0] * first + bend * second);
   s.j2m1 = j2m1;
-  if (softens) s.alpha = min(s.alpha + opened, T(kAlphaMax));
+  if (softens) {
+    // A crack in what is still pressed leaves no gap that pressure could close.
+    const T grown = s.alpha + opened, loose = slack * (abs(trial[0]) + abs(trial[2]));
+    s.alpha = j2m1 < T(0) - loose ? max(s.alpha, min(grown, T(0))) : min(grown, T(kAlphaMax));
+  }
   return true;
 }
 
@@ -162,7 +169,7 @@ GSF_HOST_DEVICE bool open_cracks(const NaccMaterial<T>& m, bool softens, NaccSta
 template <typename T>
 GSF_HOST_DEVICE bool slide(const NaccMaterial<T>& m, NaccState<T>& s) {
   using std::sqrt;
-  const T slack = sizeof(T) == 4 ? T(1e-6) : T(2e-15);
+  const T slack = kRankineSlack<T>;
   const T q = T(1.224744871391589) * m.mu * sqrt(norm2(s.d));
   const T p = T(-0.5) * m.kappa * s.j2m1;
   const T most =
