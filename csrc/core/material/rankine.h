@@ -1,6 +1,6 @@
-// Rankine's tension cut-off, softened by what has opened, with a bound on shear beside it: the other
-// yield surface of brittle matter (docs/theory/return-mapping.md). Feenstra and de Borst 1996 for
-// the corners of the cut-off, Bazant and Oh 1983 for the energy per volume.
+// Rankine's tension cut-off, softened by what has opened, with a bound on shear beside it: the
+// other yield surface of brittle matter (docs/theory/return-mapping.md). Feenstra and de Borst 1996
+// for the corners of the cut-off, Bazant and Oh 1983 for the energy per volume.
 //
 //   tau_i <= f(alpha),   f = beta kappa sinh(xi max(-alpha, 0))       principal Kirchhoff stresses
 //   q <= max(c f, M p)                                                c = -eta of the row
@@ -8,8 +8,8 @@
 // Associated flow opens along the principal directions that are pulled, and alpha grows by what
 // has opened, so that whatever the path the loss of all strength takes the integral of f over alpha
 // per initial volume, no more and no less. Shear flows at constant volume and counts as no damage.
-// Past zero alpha is the log volume that opened where broken matter lost all stress, and has to close
-// before it presses again (Tampubolon et al. 2017).
+// Past zero alpha is the log volume that opened where broken matter lost all stress, and has to
+// close before it presses again (Tampubolon et al. 2017).
 #pragma once
 
 #include "core/material/nacc.h"
@@ -17,7 +17,7 @@
 
 namespace gsf {
 
-inline constexpr double kSteepestOpening = 0.98;   // -df/dalpha over kappa that a round counts on
+inline constexpr double kSteepestOpening = 0.98;  // -df/dalpha over kappa that a round counts on
 // A state that was returned is inside, whatever rounding and the last round left.
 template <typename T>
 inline constexpr T kRankineSlack = sizeof(T) == 4 ? T(4e-6) : T(1e-12);
@@ -113,8 +113,7 @@ GSF_HOST_DEVICE bool open_cracks(const NaccMaterial<T>& m, bool softens, NaccSta
   const T y[3] = {found.x, found.y, found.z};
   const T mean = T(0.5) * m.kappa * s.j2m1;
   const TensileStrength<T> before = tensile_strength(m, s.alpha);
-  if (!(m.mu * y[0] + mean >
-        before.value + slack * (before.value + m.mu * abs(y[0]) + abs(mean))))
+  if (!(m.mu * y[0] + mean > before.value + slack * (before.value + m.mu * abs(y[0]) + abs(mean))))
     return false;
   const T shift = unit_det_shift(s.d), third = T(1.0 / 6.0) * log1p(s.j2m1);
   T trial[3], log_v[3], stress[3], iso[3];

@@ -56,7 +56,9 @@ def _slide(d: Tensor, j2m1: Tensor, alpha: Tensor, m: Material) -> tuple[Tensor,
     slack = SLACK[d.dtype]
     size = (d[:, :3] ** 2).sum(1) + 2.0 * (d[:, 3:] ** 2).sum(1)
     q = (1.5 * size.clamp(min=1e-60)).sqrt() * m.mu
-    most = torch.maximum(-m.shear_damage * strength(m, alpha)[0], -0.5 * m.friction * m.kappa * j2m1)
+    most = torch.maximum(
+        -m.shear_damage * strength(m, alpha)[0], -0.5 * m.friction * m.kappa * j2m1
+    )
     most = most.clamp(min=0.0)
     slides = q > most * (1.0 + slack)
     return torch.where(slides[:, None], (most / q)[:, None] * d, d), slides
