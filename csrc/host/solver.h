@@ -242,7 +242,7 @@ struct SolverOps {
     comes_with(kObject, kContactRadius);
     comes_with(kObject, kPress);
     for (int i = kDamageSumUnits; i < kDamageScale; ++i)
-      STD_TORCH_CHECK(!device || ints[kLawSet] != kDamageField || b[i].numel() > 0,
+      STD_TORCH_CHECK(!device || !with_damage(ints[kLawSet]) || b[i].numel() > 0,
                       "solver: ", wanted[i].name, " is missing");
     const bool any_law = ints[kLawSet] != 0;
     STD_TORCH_CHECK(!any_law || (b[kAlpha].numel() == n && b[kPeak].numel() == n),

@@ -29,6 +29,7 @@ from gsfluent.ops.plasticity import LAWS, check_params, compiled_apart
 from gsfluent.ops.solver_ranks import MOST_RANKS, Parts, check_devices
 from gsfluent.ops.solver_state import (
     DAMAGE_FIELD,
+    DAMAGE_QUIET,
     MORE_LAWS,
     VISCOUS,
     VISCOUS_ANY,
@@ -315,6 +316,8 @@ class Solver(SolverState):
             cfl=cfl, gradient_limit=gradient_limit, dt_scale=1.0, dt_fixed=dt or 0.0,
             dt_most=math.sqrt(cfl * self.dx / max(math.hypot(*self.gravity), 1e-12)),
             mass_unit=math.ldexp(1.0, math.frexp(heaviest)[1] + 1 - bits), unit_bits=bits,
+            # rounds on a GPU leave the damage field out until a point is near its threshold
+            quiet=int(self._whole.damage_scale.numel() > 0),
         )  # fmt: skip
 
     def _hold(self, breaks: bool, flip: float, given: Iterable[str]) -> None:
@@ -417,7 +420,8 @@ class Solver(SolverState):
             )
 
     def _settings(self) -> tuple[list[int], list[float]]:
-        ints = [self.fields, int(self.implicit), int(self.irreversible), self._law_set,
+        laws = DAMAGE_QUIET if self.clock()["quiet"] else self._law_set
+        ints = [self.fields, int(self.implicit), int(self.irreversible), laws,
                 self.ranks, self.count]  # fmt: skip
         floats = [
             self.dx, *self.gravity, self.friction, self.restitution, self.contact_gap, self.k,
@@ -495,6 +499,7 @@ class Solver(SolverState):
                     return
                 if now["grow"]:
                     self._grow(now)
+                    ints, floats = self._settings()
                 rounds, steps = self._rounds(now), self.steps_per_round
                 if self._parts is None:
                     torch.ops.gsfluent.solver_run(self._whole.listed(), ints, floats, rounds, steps)
@@ -517,8 +522,9 @@ class Solver(SolverState):
         return math.ceil(left * (each + 0.6 * built)) + 1
 
     def _grow(self, now: dict[str, float]) -> None:
-        """Make room for more blocks; every present value is kept."""
+        """Make room for more blocks, or let the damage field be solved; every value is kept."""
         b = self._whole
+        quiet = int(now["quiet"] and int(b.damage_counts[0]) == 0)
         homes, slots = b.home_start0.shape[0], b.slot_next.shape[0]
         if now["wanted_homes"] > homes or now["wanted_slots"] > slots:  # else a rank wants more
             homes = max(int(1.5 * now["wanted_homes"]) + 64, homes)
@@ -526,7 +532,7 @@ class Solver(SolverState):
             b.reserve_blocks(homes, slots, self.fields)
         if self._parts is not None:
             self._parts.grow()
-        self._write(grow=0, rebuild=1)
+        self._write(grow=0, rebuild=1, quiet=quiet)
 
     def rank_counts(self) -> list[dict[str, int]]:
         """What each rank holds since the last build of blocks.

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-CLOCK_WORDS = 52
+CLOCK_WORDS = 53
 BLOCK_NODES = 64
 NEIGHBOURS = 27
 SITE_FIELDS = 16
@@ -50,7 +50,7 @@ CLOCK = (
     "plastic", "guarded", "inverted", "invalid", "contact_nodes", "contact_steps", "builds",
     "wanted_homes", "wanted_slots", "homes_max", "slots_max", "particle_steps",
     "touched", "lost", "unit_bits", "shared_sites", "speed_seen", "wave_seen", "leaving", "slack",
-    "travel", "moved", "dt_most", "shared_homes",
+    "travel", "moved", "dt_most", "shared_homes", "quiet",
 )  # fmt: skip
 """Members of ``SolverClock``, word by word."""
 INDEX = {name: index for index, name in enumerate(CLOCK)}

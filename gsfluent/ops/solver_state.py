@@ -24,7 +24,7 @@ from gsfluent.ops.solver_points import UNBROKEN
 from gsfluent.ops.solver_ranks import Parts
 from gsfluent.ops.viscous import viscous_step
 
-MORE_LAWS, DAMAGE_FIELD, VISCOUS, VISCOUS_ANY = 3, 4, 5, 6
+MORE_LAWS, DAMAGE_FIELD, VISCOUS, VISCOUS_ANY, DAMAGE_QUIET = 3, 4, 5, 6, 7
 """Sets of laws past the plain ones, ``LawSet`` of ``csrc/core/solver/particle.h``."""
 _VALUES = {"position", "body", "velocity", "affine", "strain", "alpha", "peak", "deformation",
            "viscous", "stress"}  # fmt: skip

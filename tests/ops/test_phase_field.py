@@ -132,6 +132,20 @@ def test_only_tensile_stress_drives_by_rankine() -> None:
     assert float(drive["rankine"][1]) < 1e-9 < 0.1 * float(drive["spectral"][1])
 
 
+def test_a_crack_along_the_load_is_not_driven_by_what_widens() -> None:
+    """Pressed along x and free across, where it has lost stiffness: nothing pulls there."""
+    lame, whole = KAPPA - 2.0 / 3.0 * MU, 0.5
+    g = (1.0 - reference.RESIDUAL) * whole**2 + reference.RESIDUAL
+    across = 0.01 * lame / (2.0 * lame + 2.0 * MU * g)  # lame tr h + 2 mu g h = 0
+    log_v = torch.tensor([[-0.01, across, across]], dtype=torch.float64)
+    strain = torch.cat([torch.expm1(2.0 * log_v), torch.zeros(1, 3, dtype=torch.float64)], dim=1)
+    alpha = torch.full((1,), -1.0, dtype=torch.float64)
+    given = {"law": LAW, "params": row(1.0 - whole, "rankine")}
+    _, after, stress, _ = ops.return_mapping(strain, alpha, still(1), **given)
+    assert stress[0, 1:3].abs().max() < 1e-9 * stress[0, 0].abs()
+    assert float(after) + 1.0 < 1e-9
+
+
 def test_broken_matter_forgets_what_it_has_opened() -> None:
     wide = torch.tensor([[3.0, 3.0, 3.0, 1.5, 0.0, 0.0]], dtype=torch.float64)
     alpha = torch.zeros(1, dtype=torch.float64)

@@ -108,6 +108,23 @@ def test_what_is_saved_goes_on_as_it_would_have() -> None:
         assert torch.equal(getattr(solver, name), value), name
 
 
+def test_rounds_leave_the_field_out_until_it_is_wanted() -> None:
+    given = on("cuda", plates(torch.float64))
+    strong = given | {"params": given["params"].clone()}
+    strong["params"][:, 2] *= 1e4  # its threshold
+    whole = run(strong, 30)
+    assert whole.clock()["quiet"] and float(whole.peak.max()) == -1.0
+    have, always = ops.Solver(**given, dt=DT), ops.Solver(**given, dt=DT)
+    assert have.clock()["quiet"]
+    always._write(quiet=0)
+    for solver in (have, always):
+        solver.advance(steps=40)
+    assert not have.clock()["quiet"] and float(have.peak.max()) > 0.0
+    assert have.counters()["step"] == always.counters()["step"] == 40
+    for name in NAMES:
+        assert error(getattr(have, name), getattr(always, name).cpu()) <= 1e-10, name
+
+
 def test_room_for_blocks_grows_while_it_cracks() -> None:
     given = on("cuda", plates(torch.float32))
     tight = ops.Solver(**given, dt=DT)

@@ -121,7 +121,7 @@ GSF_HOST_DEVICE PhaseState<T> phase_state(T mu, T kappa, T damage, T all, const 
 }
 
 // Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2. kSplitRankine
-// has <largest principal stress of the whole>^2 / 2E in the place of psi+ as what drives.
+// has <largest principal stress over g>^2 / 2E in the place of psi+ as what drives.
 template <typename T>
 GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m, const Sym3<T>& e) {
   using std::log1p;
@@ -153,7 +153,9 @@ GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m,
   const T lambda = m.kappa - T(2.0 / 3.0) * m.mu;
   const T log_j = h[0] + h[1] + h[2], open = max(log_j, T(0)), pressed = min(log_j, T(0));
   const Sym3<T> stress = T(2) * m.mu * ((g - T(1)) * plus + log_v);
-  const T pull = max(lambda * log_j + T(2) * m.mu * h[0], T(0));
+  // What damaged matter bears, over g: pressed along one axis it widens across until nothing pulls
+  // there, and that must not drive it on.
+  const T pull = max(lambda * (open + pressed / g) + T(2) * m.mu * h[0], T(0));
   const T young = T(9) * m.kappa * m.mu / (T(3) * m.kappa + m.mu);
   const T squares = up[0] * up[0] + up[1] * up[1] + up[2] * up[2];
   const T active = split_of(m) == kSplitRankine ? T(0.5) * pull * pull / young

@@ -18,6 +18,8 @@ inline constexpr double kWeakening = 0.02;
 // kMoreLaws: those of more_laws.h too (on the CPU solver_more.cpp).
 // kDamageField: elastic, NACC and phase_field (cpu/solver/solver_fields.cpp,
 // cuda/solver/damage.cu).
+// kDamageQuiet: the same matter as long as nothing is near its threshold (CUDA; no kernels of its
+// own).
 // kViscousBrittle, kViscousAny: as kBrittle, kAnyLaw, with springs beside elastic and NACC matter
 // (core/material/viscous.h; on the CPU solver_viscous.cpp).
 enum LawSet : int {
@@ -27,8 +29,10 @@ enum LawSet : int {
   kMoreLaws = 3,
   kDamageField = 4,
   kViscousBrittle = 5,
-  kViscousAny = 6
+  kViscousAny = 6,
+  kDamageQuiet = 7
 };
+constexpr bool with_damage(int64_t laws) { return laws == kDamageField || laws == kDamageQuiet; }
 constexpr bool with_springs(int laws) { return laws == kViscousBrittle || laws == kViscousAny; }
 
 // Weights at offset o in [0, 1): the stencil of grid.h with f = o + 1/2. `base` stays unset.

@@ -146,8 +146,9 @@ struct SolverClock {
   uint64_t moved;        // 49 bits: furthest a collider moved in this step
   double dt_most;        // 50 longest automatic step [s]
   int64_t shared_homes;  // 51 homes whose window touches shared blocks (CUDA)
+  int64_t quiet;         // 52 rounds leave out the damage field, and end where it is wanted (CUDA)
 };
-constexpr int kClockWords = 52;
+constexpr int kClockWords = 53;
 static_assert(sizeof(SolverClock) == 8 * kClockWords, "the clock is read word by word");
 
 template <typename T>
@@ -295,6 +296,11 @@ GSF_HOST_DEVICE bool may_step(const SolverClock& c) {
 }
 GSF_HOST_DEVICE bool may_build(const SolverClock& c) {
   return (c.done | c.grow | c.reason) == 0 && c.rebuild != 0;
+}
+// Whether rounds without the damage field have come to points that it is to be solved for.
+template <typename T>
+GSF_HOST_DEVICE bool wants_damage(const SolverView<T>& s) {
+  return s.clock->quiet != 0 && s.damage_counts[0] != 0;
 }
 
 }  // namespace gsf

@@ -378,6 +378,7 @@ __global__ void finish_kernel(const __grid_constant__ SolverView<T> s) {
   c.builds += 1;
   c.rebuild = 0;
   c.travel = 0.0;
+  if (wants_damage(s)) c.grow = 1;
   if (s.peers == nullptr || c.homes > 0) return;
   for (int64_t i = 0; i < kMailWords + s.collider_count * kImpulseSums; ++i)
     s.mail[i] = 0;  // nobody else tells for a rank without points

@@ -446,15 +446,15 @@ void solver_damage_begin(const SolverView<T>& s, cudaStream_t stream) {
 }
 
 template <typename T>
-void solver_damage_end(const SolverView<T>& s, cudaStream_t stream) {
-  cudaStreamWaitEvent(stream, Beside<T>::here().done, 0);
+void solver_damage_end(const SolverView<T>& s, bool begun, cudaStream_t stream) {
+  if (begun) cudaStreamWaitEvent(stream, Beside<T>::here().done, 0);
   launch_g2p<T, kDamageField, false>(s, stream);
 }
 
 #define GSF_INSTANTIATE(T)                                                  \
   template void solver_damage_marks<T>(const SolverView<T>&, cudaStream_t); \
   template void solver_damage_begin<T>(const SolverView<T>&, cudaStream_t); \
-  template void solver_damage_end<T>(const SolverView<T>&, cudaStream_t);
+  template void solver_damage_end<T>(const SolverView<T>&, bool, cudaStream_t);
 GSF_INSTANTIATE(float)
 GSF_INSTANTIATE(double)
 #undef GSF_INSTANTIATE

@@ -62,6 +62,7 @@ __device__ __noinline__ void end_of_step(const SolverView<T>& s) {
   clock.travel += float_of_bits(clock.moved);
   clock.moved = 0;
   end_step(clock, double(s.dx), s.total);
+  if (wants_damage(s)) clock.grow = 1;  // the host goes on with rounds that have it
   choose_unit(clock);
   *s.clock = clock;
 }

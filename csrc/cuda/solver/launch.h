@@ -49,7 +49,7 @@ void solver_damage_marks(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
 void solver_damage_begin(const SolverView<T>& s, cudaStream_t stream);
 template <typename T>
-void solver_damage_end(const SolverView<T>& s, cudaStream_t stream);
+void solver_damage_end(const SolverView<T>& s, bool begun, cudaStream_t stream);
 // Points that are pushed: what of their rows a step needs, and what they get in one, in parts
 // between which several ranks wait for each other.
 template <typename T>

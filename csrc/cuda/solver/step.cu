@@ -108,7 +108,7 @@ void solver_prime_points(const SolverView<T>& s, int law_set, bool measure, cuda
     prime_kernel<T, kViscousAny><<<homes, kThreads, 0, stream>>>(s, measure);
   else if (law_set == kMoreLaws)
     prime_kernel<T, kMoreLaws><<<homes, kThreads, 0, stream>>>(s, measure);
-  else if (law_set == kDamageField)
+  else if (with_damage(law_set))
     prime_kernel<T, kDamageField><<<homes, kThreads, 0, stream>>>(s, measure);
   else
     prime_kernel<T, kAnyLaw><<<homes, kThreads, 0, stream>>>(s, measure);
@@ -153,8 +153,8 @@ void solver_from_nodes(const SolverView<T>& s, int law_set, cudaStream_t stream)
     launch_g2p<T, kViscousAny, false>(s, stream);
   else if (law_set == kMoreLaws)
     launch_g2p<T, kMoreLaws, false>(s, stream);
-  else if (law_set == kDamageField)
-    solver_damage_end(s, stream);
+  else if (with_damage(law_set))
+    solver_damage_end(s, law_set == kDamageField, stream);
   else
     launch_g2p<T, kAnyLaw, false>(s, stream);
 }

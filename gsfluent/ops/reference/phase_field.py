@@ -101,7 +101,7 @@ def split_energy(strain: Tensor, m: Material) -> tuple[Tensor, Tensor]:
 
 
 def drive(strain: Tensor, m: Material) -> Tensor:
-    """What drives damage [J/m^3], [N]: psi+, or by ``rankine`` the largest principal stress."""
+    """What drives damage [J/m^3], [N]: psi+, or by ``rankine`` the largest tensile stress."""
     found = split_energy(strain, m)[0]
     rankine = (m.shear_damage.detach().long() & 3) == SPLITS["rankine"]
     if bool(rankine.any()):
@@ -109,7 +109,10 @@ def drive(strain: Tensor, m: Material) -> Tensor:
         largest = torch.cat(
             [torch.linalg.eigvalsh(m)[:, -1] for m in to_matrix(log_v).split(EIGEN_BATCH)]
         )
-        pull = (m.kappa - 2.0 / 3.0 * m.mu) * log_v[:, :3].sum(1) + 2.0 * m.mu * largest
+        log_j = log_v[:, :3].sum(1)
+        # what it bears, over g: what is pressed loses no stiffness
+        volume = log_j.clamp(min=0.0) + log_j.clamp(max=0.0) / degradation(m.cohesion)
+        pull = (m.kappa - 2.0 / 3.0 * m.mu) * volume + 2.0 * m.mu * largest
         young = 9.0 * m.kappa * m.mu / (3.0 * m.kappa + m.mu)
         found = torch.where(rankine, 0.5 * pull.clamp(min=0.0) ** 2 / young, found)
     return found

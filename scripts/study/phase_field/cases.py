@@ -274,9 +274,9 @@ def jobs(quick: bool, device: str) -> list[Job]:
         )  # fmt: skip
     for name in THROWS:
         add("floor", name, name, 300.0, lambda n=name: floor(n, 4 if quick else 6, device))
-    for height in (0.6,) if quick else (0.4, 0.6):
+    for height in (0.6,) if quick else (0.5, 0.6, 0.75):
         for count in (20,) if quick else (20, 30, 40):
-            for seed in range(1 if quick else 8):
+            for seed in range(1 if quick else 8 if height == 0.6 else 3):
                 add(
                     "melon", f"rankine_{height:g}_{count}_{seed}", f"{height:g} m",
                     (count / 10.0) ** 4,

@@ -1,10 +1,13 @@
 """Three-point bending by finite elements: what the beam of the study is held against.
 
-    python scripts/study/phase_field/elements.py OUT [--fine 0.03] [--steps 40]
+    python scripts/study/phase_field/elements.py OUT [--fine 0.03] [--steps 40] [--blunt 0.09]
 
 The beam of :func:`cases.bending`: 8 x 2 mm in plane strain, notch of 0.4 mm, AT2 without a split,
 l 0.06 mm. Bilinear squares, small strains, forces and damage solved in turn until neither moves,
-history as Miehe's. Leaves bending_elements.json in OUT, which run.py --enter reads.
+history as Miehe's. A crack through elements costs 1 + fine / 2 l of Gc, so they work with that
+much less. By --blunt the notch is that wide and what bears the beam touches it by edges a width of
+0.15 mm apart, as on the grid of the study. Leaves bending_elements*.json in OUT, which run.py
+--enter reads.
 """
 
 from __future__ import annotations
@@ -26,13 +29,17 @@ from gsfluent.lab.charts.record import machine
 
 Floats = NDArray[np.float64]
 WIDE, HIGH, DEEP, LENGTH = 8e-3, 2e-3, 4e-4, 6e-5
+PAD = 7.5e-5  # half the width of the bars that bear the beam of the study
 RESIDUAL = 1e-4
 GAUSS = [np.array(p) / np.sqrt(3.0) for p in itertools.product((-1.0, 1.0), repeat=2)]
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
-def lines(fine: float) -> tuple[Floats, Floats]:
-    """Places of the columns and rows of nodes [m]: fine in the middle, coarser to the ends."""
+def lines(fine: float, bears: float) -> tuple[Floats, Floats]:
+    """Places of the columns and rows of nodes [m]: fine in the middle, coarser to the ends.
+
+    One column is where the beam is borne, this far from its middle.
+    """
     inner = np.arange(0.0, 6e-4 + 0.5 * fine, fine)
     outer = [inner[-1]]
     while outer[-1] < 0.5 * WIDE - 1e-9:
@@ -40,6 +47,7 @@ def lines(fine: float) -> tuple[Floats, Floats]:
         left = 0.5 * WIDE - outer[-1]
         outer.append(outer[-1] + (step if left > 1.5 * step else left))
     half = np.concatenate([inner, outer[1:]])
+    half[np.argmin(np.abs(half - bears))] = bears
     columns = 0.5 * WIDE + np.concatenate([-half[:0:-1], half])
     return columns, np.linspace(0.0, HIGH, round(HIGH / fine) + 1)
 
@@ -47,8 +55,10 @@ def lines(fine: float) -> tuple[Floats, Floats]:
 class Beam:
     """Elements of half and half a notch: its two faces have nodes of their own."""
 
-    def __init__(self, fine: float) -> None:
-        x, y = lines(fine)
+    def __init__(self, fine: float, blunt: float = 0.0) -> None:
+        self.toughness = BEAM_TOUGHNESS / (1.0 + 0.5 * fine / LENGTH)
+        edge = PAD if blunt else 0.0
+        x, y = lines(fine, 0.5 * WIDE - 2e-4 - edge)
         nx, ny = len(x), len(y)
         number = np.arange(nx * ny).reshape(nx, ny)
         self.place = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
@@ -61,6 +71,10 @@ class Beam:
             of = twin if i == middle else number
             cells.append([of[i, j], of[i + 1, j], of[i + 1, j + 1], of[i, j + 1]])
         self.cells = np.array(cells)
+        middles = self.place[self.cells].mean(axis=1)
+        gone = (np.abs(middles[:, 0] - 0.5 * WIDE) < 0.5 * blunt) & (middles[:, 1] < DEEP)
+        kept, self.cells = np.unique(self.cells[~gone], return_inverse=True)
+        self.place, self.cells = self.place[kept], self.cells.reshape(-1, 4)
         size = np.stack([self.place[self.cells[:, 2]] - self.place[self.cells[:, 0]]])[0]
         self.weight = 0.25 * size.prod(axis=1)
         young, poisson, _ = BEAM
@@ -78,9 +92,12 @@ class Beam:
             )  # fmt: skip
             self.slope.append(own[None] * (2.0 / size)[:, None, :])
         low, top = self.place[:, 1] < 1e-9, self.place[:, 1] > HIGH - 1e-9
-        ends = [int(np.argmin(np.abs(self.place[:, 0] - x) + 1e3 * ~low)) for x in (2e-4, 7.8e-3)]
-        self.press = int(np.argmin(np.abs(self.place[:, 0] - 0.5 * WIDE) + 1e3 * ~top))
-        self.held = np.array([2 * ends[0] + 1, 2 * ends[1] + 1, 2 * self.press, 2 * self.press + 1])
+        places = (2e-4 + edge, WIDE - 2e-4 - edge)
+        ends = [int(np.argmin(np.abs(self.place[:, 0] - x) + 1e3 * ~low)) for x in places]
+        near = np.abs(np.abs(self.place[:, 0] - 0.5 * WIDE) - edge) + 1e3 * ~top
+        pressed = np.flatnonzero(near < near.min() + 1e-9)
+        self.press = 2 * pressed + 1
+        self.held = np.array([2 * ends[0] + 1, 2 * ends[1] + 1, 2 * pressed[0], *self.press])
         self.damage = np.zeros(len(self.place))
         self.history = np.zeros((4, len(self.cells)))
         # the load and the supports bear on points, where nothing may be damaged
@@ -105,12 +122,12 @@ class Beam:
             k += left[:, None, None] * np.einsum("eia,ij,ejb->eab", b, self.stiff, b)
         matrix = _sparse(k, wide, 2 * len(self.place))
         u = np.zeros(2 * len(self.place))
-        u[self.held[-1]] = -way
+        u[self.press] = -way
         free = np.setdiff1d(np.arange(len(u)), self.held)
         rows = matrix[free]
         u[free] = _factors(rows[:, free].tocsc()).solve(-(rows @ u))
         self.drive(u[wide])
-        return u, -float((matrix[self.held[-1]] @ u)[0])
+        return u, -float((matrix[self.press] @ u).sum())
 
     def drive(self, u: Floats) -> None:
         """The history of the displacements of the elements' corners, kept in ``now``."""
@@ -125,9 +142,9 @@ class Beam:
         k, f = np.zeros((len(self.cells), 4, 4)), np.zeros((len(self.cells), 4))
         for g in range(4):
             n, s = self.shape[g], self.slope[g]
-            local = (2.0 * self.now[g] + BEAM_TOUGHNESS / LENGTH) * self.weight
+            local = (2.0 * self.now[g] + self.toughness / LENGTH) * self.weight
             k += local[:, None, None] * np.outer(n, n)
-            k += (BEAM_TOUGHNESS * LENGTH * self.weight)[:, None, None] * (s @ s.transpose(0, 2, 1))
+            k += (self.toughness * LENGTH * self.weight)[:, None, None] * (s @ s.transpose(0, 2, 1))
             f += (2.0 * self.now[g] * self.weight)[:, None] * n
         right = np.bincount(self.cells.ravel(), f.ravel(), len(self.place))
         self.damage = _factors(_sparse(k, self.cells, len(self.place)).tocsc()).solve(right)
@@ -154,10 +171,11 @@ def main() -> int:
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--fine", type=float, default=0.03, help="edge in the middle [mm]")
     parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--blunt", type=float, default=0.0, help="width of the notch [mm]")
     parser.add_argument("--far", type=float, default=0.06, help="way of the load [mm]")
     args = parser.parse_args()
     begin = time.perf_counter()
-    beam = Beam(1e-3 * args.fine)
+    beam = Beam(1e-3 * args.fine, 1e-3 * args.blunt)
     ways, forces = [], []
     for way in np.linspace(0.0, 1e-3 * args.far, args.steps + 1)[1:]:
         for _ in range(60):
@@ -174,12 +192,14 @@ def main() -> int:
             break
     at = int(np.argmax(forces))
     args.out.mkdir(parents=True, exist_ok=True)
+    kind = f"notch of {args.blunt:g} mm" if args.blunt else "slit"
     found = {
-        "test": "elements", "setting": f"elements of {args.fine:g} mm", "force": forces[at] / 1e6,
+        "test": "elements", "blunt": args.blunt, "force": forces[at] / 1e6,
+        "setting": f"elements of {args.fine:g} mm, {kind}",
         "moved": 1e6 * ways[at], "off": 0.0, "wall": time.perf_counter() - begin,
         "points": len(beam.place), "curve": [ways, forces], "machine": machine("cpu"),
     }  # fmt: skip
-    with atomic_path(args.out / "bending_elements.json") as path:
+    with atomic_path(args.out / f"bending_elements{'_blunt' if args.blunt else ''}.json") as path:
         path.write_text(json.dumps(found), encoding="utf-8")
     return 0
 

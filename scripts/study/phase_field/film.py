@@ -1,15 +1,16 @@
-"""A pane of glass and a bowl of porcelain thrown to the floor, by both laws side by side.
+"""A pane of glass that falls onto a ball and a bowl of porcelain that lands, by both laws.
 
     python scripts/study/phase_field/film.py OUT [--cells 64] [--device cuda] [--only pane,bowl]
 
-Writes OUT/laws.mp4 (where imageio-ffmpeg is installed) and OUT/laws.jpg, four moments of it; with
---enter the picture goes to docs/images/phase_field_laws.jpg. Points are coloured by piece; grey is
-what has come off as powder.
+Writes OUT/laws.mp4 (where imageio-ffmpeg is installed) and OUT/laws.jpg, four moments of it, seen
+from above. With --enter the picture goes to docs/images/phase_field_laws.jpg. Points are coloured
+by piece; grey is what has come off as powder.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import shutil
@@ -28,7 +29,9 @@ from gsfluent.scene.scene import Scene
 
 PICTURE = Path(__file__).resolve().parents[3] / "docs" / "images" / "phase_field_laws.jpg"
 LAWS = ("nacc", "phase_field")
-FPS, SECONDS = 400, 0.04
+FPS, SECONDS = 800, 0.016
+BALL = 0.02
+"""Radius of what the pane falls onto [m]."""
 MOMENTS = (0.15, 0.35, 0.6, 1.0)
 
 
@@ -65,28 +68,56 @@ def turned(angle: float, axis: int) -> Frame:
     return Frame(turn, torch.zeros(3), 1.0)
 
 
-def ware(name: str, law: str) -> materials.Material:
-    """A preset under a law; a phase field keeps the strength, and only tension breaks it."""
-    field = {"prefer": "strength", "split": "rankine"} if law == "phase_field" else {}
-    return materials.get(name).override(law=law, **field)
+@dataclasses.dataclass(frozen=True)
+class Fall:
+    """A body that falls, of the same matter by both laws.
+
+    Attributes:
+        material: Preset.
+        strength: In tension [Pa]; both laws keep it, and so give up the toughness.
+        softening: Of the preset: it breaks at a strain of its root times that of real matter.
+        speed: At which it lands [m/s].
+        walls: Thickness [cells].
+    """
+
+    material: str
+    strength: float
+    softening: float
+    speed: float
+    walls: float
+
+    def ware(self, law: str) -> materials.Material:
+        """Its matter under a law; a phase field is driven by tension alone."""
+        split = {"split": "rankine"} if law == "phase_field" else {}
+        return materials.get(self.material).override(
+            law=law, prefer="strength", softening=self.softening, tensile_strength=self.strength,
+            **split,
+        )  # fmt: skip
 
 
-def pane(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float]:
-    """A pane of 0.3 m that is thrown down on a corner, and the size of a cell."""
+FALLS = {
+    "pane": Fall("glass", 2.8e7, 300.0, 6.3, 4.0),
+    "bowl": Fall("ceramic", 3e7, 300.0, 6.0, 4.0),
+}
+
+
+def pane(cells: int, law: str, fall: Fall) -> tuple[Scene, float]:
+    """A pane of 0.3 m that falls flat onto a ball, and the size of a cell."""
     dx = 0.3 / cells
-    half = (0.15, 0.1, 0.5 * walls * dx)
+    half = (0.15, 0.1, 0.5 * fall.walls * dx)
     body = solid(half, lambda x: (x.abs() <= torch.tensor(half)).all(dim=-1), 0.5 * dx)
     scene = Scene()
-    lean = Frame(turned(0.5, 1).rotation @ turned(0.4, 0).rotation, torch.zeros(3), 1.0)
-    scene.add(body, ware("glass", law), frame=lean, velocity=(0.0, 0.0, -speed))
-    scene.drop(0.01)
+    scene.add(body, fall.ware(law))
+    scene.add_collider("sphere", at=(0.03, -0.015, BALL), radius=BALL)
+    scene.drop(2.0 * BALL + 0.002)
+    scene.throw((0.0, 0.0, -fall.speed), spin=(4.0, 5.0, 0.0))
     return scene, dx
 
 
-def bowl(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float]:
-    """A bowl of 0.16 m that is thrown down on its bottom, and the size of a cell."""
+def bowl(cells: int, law: str, fall: Fall) -> tuple[Scene, float]:
+    """A bowl of 0.16 m that lands on its bottom, and the size of a cell."""
     dx = 0.16 / cells
-    wall = walls * dx
+    wall = fall.walls * dx
 
     def inside(x: torch.Tensor) -> torch.Tensor:
         radius = x.norm(dim=-1)
@@ -94,16 +125,17 @@ def bowl(cells: int, law: str, speed: float, walls: float) -> tuple[Scene, float
 
     body = solid((0.08, 0.08, 0.08), inside, 0.5 * dx)
     scene = Scene()
-    scene.add(body, ware("ceramic", law), frame=turned(0.25, 1), velocity=(0.0, 0.0, -speed))
-    scene.drop(0.005)
+    scene.add(body, fall.ware(law), frame=turned(0.25, 1))
+    scene.drop(0.002)
+    scene.throw((0.0, 0.0, -fall.speed))
     return scene, dx
 
 
 def run(
-    make: Any, cells: int, law: str, speed: float, walls: float, device: str
+    make: Any, cells: int, law: str, fall: Fall, device: str
 ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, Any]]:
     """Positions and pieces of every frame, and figures of the last."""
-    scene, dx = make(cells, law, speed, walls)
+    scene, dx = make(cells, law, fall)
     simulation = Simulate(dx=dx, device=device)(scene, fps=FPS, seconds=SECONDS)
     places, pieces = [], []
     for frame in simulation:
@@ -123,17 +155,15 @@ def run(
 
 
 def draw(axis: Any, place: np.ndarray, piece: np.ndarray, name: str) -> None:
-    """One frame, from a little above."""
+    """One frame, from above: what lies highest hides the rest."""
     from matplotlib import colormaps
 
-    tilt = math.radians(20.0)
-    across, up = place[:, 0], place[:, 2] * math.cos(tilt) + place[:, 1] * math.sin(tilt)
-    order = np.argsort(-place[:, 1] * math.cos(tilt) + place[:, 2] * math.sin(tilt))
+    order = np.argsort(place[:, 2])
     shade = np.random.default_rng(1).permutation(20)
     color = np.where(piece >= 0, shade[np.maximum(piece, 0) % 20], -1)
     axis.set_facecolor("#1c1c20")
-    tints = [(0.54, 0.54, 0.54), *colormaps["tab20"].colors]
-    axis.scatter(across[order], up[order], s=0.5, c=[tints[c + 1] for c in color[order]])
+    tints = np.array([(0.54, 0.54, 0.54), *colormaps["tab20"].colors])
+    axis.scatter(place[order, 0], place[order, 1], s=3.0, lw=0, c=tints[color[order] + 1])
     axis.set_title(name, fontsize=9)
     axis.set_xticks([])
     axis.set_yticks([])
@@ -146,11 +176,8 @@ def main() -> int:
     )
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--cells", type=int, default=64, help="along the longest side")
-    parser.add_argument("--speed", type=float, default=2.5, help="of the throw [m/s]")
-    parser.add_argument(
-        "--walls", type=float, default=12.0,
-        help="thickness [cells]; what is thinner than cracks are wide is punched through",
-    )  # fmt: skip
+    for name, unit in (("speed", "m/s"), ("walls", "cells"), ("strength", "Pa")):
+        parser.add_argument(f"--{name}", type=float, help=f"another than that of FALLS [{unit}]")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--only", default="pane,bowl", metavar="BODY,...")
     parser.add_argument("--enter", action="store_true", help="the picture becomes that of the docs")
@@ -162,10 +189,13 @@ def main() -> int:
 
     args.out.mkdir(parents=True, exist_ok=True)
     made = {"pane": pane, "bowl": bowl}
+    other = {name: getattr(args, name) for name in ("speed", "walls", "strength")}
+    other = {name: value for name, value in other.items() if value is not None}
     shown: dict[tuple[str, str], Any] = {}
     for body in args.only.split(","):
+        fall = dataclasses.replace(FALLS[body], **other)
         for law in LAWS:
-            shown[body, law] = run(made[body], args.cells, law, args.speed, args.walls, args.device)
+            shown[body, law] = run(made[body], args.cells, law, fall, args.device)
             sys.stderr.write(f"{body} {law}: {json.dumps(shown[body, law][2])}\n")
     told = {f"{body} {law}": value[2] for (body, law), value in shown.items()}
     (args.out / "laws.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
@@ -173,18 +203,17 @@ def main() -> int:
     limits = {}
     for body in bodies:
         every = np.concatenate([p for law in LAWS for p in shown[body, law][0][::6]])
-        wide = np.abs(every[:, 0]).max() * 1.1
-        limits[body] = (-wide, wide, -0.12, every[:, 2].max() * 1.1 + 0.05)
+        limits[body] = 1.05 * np.abs(every[:, :2]).max(axis=0)
     frames = min(len(value[0]) for value in shown.values())
 
     def panel(axis: Any, body: str, law: str, index: int, name: str) -> None:
         places, pieces, _ = shown[body, law]
         draw(axis, places[index], pieces[index], name)
-        axis.set_xlim(limits[body][:2])
-        axis.set_ylim(limits[body][2:])
+        axis.set_xlim(-limits[body][0], limits[body][0])
+        axis.set_ylim(-limits[body][1], limits[body][1])
 
     figure, axes = pyplot.subplots(
-        2 * len(bodies), len(MOMENTS), figsize=(12, 5.5 * len(bodies)), squeeze=False
+        2 * len(bodies), len(MOMENTS), figsize=(12, 5.0 * len(bodies)), squeeze=False
     )
     for row, (body, law) in enumerate(shown):
         for column, part in enumerate(MOMENTS):

@@ -63,7 +63,7 @@ HEADINGS = {
     ),
     "melon": (
         "## A melon on three grids\n\n"
-        "`fruit.watermelon`, l 25 mm on every grid, `prefer: strength`."
+        "`fruit.watermelon`, l 25 mm on every grid, `prefer: strength`. Pieces after 40 ms."
     ),
 }
 """What stands above the tables that the page has not yet."""
@@ -223,16 +223,23 @@ def melon(found: Sequence[Found]) -> str:
     for split, height, cells in sorted({of(f) for f in found}):
         mine = [f for f in found if of(f) == (split, height, cells)]
         clean = [f for f in mine if f["verdict"] == "clean"]
-        pieces = [float(f["pieces"]) for f in clean]
+        pieces = [float(f.get("first", f)["pieces"]) for f in clean]
         spread = float(np.std(pieces)) if pieces else math.nan
         rows.append(
             (
                 split, f"{height:g} m", str(cells), f"{len(clean)} of {len(mine)}",
                 f"{np.mean(pieces):.1f}" if pieces else "", f"{spread:.1f}",
-                _mean([f["largest"] for f in clean]), _mean([f["broken"] for f in clean]),
+                *(
+                    _mean([(f.get("first", f) if early else f)[name] for f in clean])
+                    for name in ("largest", "broken")
+                    for early in (True, False)
+                ),
             )
         )  # fmt: skip
-    head = ("split", "height", "cells", "clean", "pieces over 3 %", "+-", "largest", "broken")
+    head = (
+        "split", "height", "cells", "clean", "pieces over 3 %", "+-", "largest after 40 ms",
+        "at the end", "broken after 40 ms", "at the end",
+    )  # fmt: skip
     return _table(head, rows)
 
 
