@@ -96,7 +96,7 @@ def main() -> int:
         "cracks, NACC elsewhere",
     )  # fmt: skip
     parser.add_argument(
-        "--contact", choices=("nodes", "points"), default="nodes",
+        "--contact", choices=("points", "nodes"), default="points",
         help="what separating colliders and other bodies push",
     )  # fmt: skip
     parser.add_argument("--method", default="", help="name in the table")
@@ -107,7 +107,7 @@ def main() -> int:
     args = parser.parse_args()
     if args.quick:
         args.repeat = 1
-    pushed = " points" if args.contact == "points" else ""
+    pushed = " nodes" if args.contact == "nodes" else ""
     args.method = args.method or METHODS[args.law] + pushed
     bad = 0
     try:

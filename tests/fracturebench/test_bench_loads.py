@@ -179,7 +179,8 @@ def test_a_row_that_yields_late_makes_its_points_viscous() -> None:
 
 
 def test_matter_that_names_the_width_of_its_cracks_breaks_by_phase_field() -> None:
-    forks, rock = (find(name).build(find(name).ladder[0], 8) for name in ("branching", "rock_press"))
+    cases = [find(name) for name in ("branching", "rock_press")]
+    forks, rock = (case.build(case.ladder[0], 8) for case in cases)
     assert [law_of(m, "named") for m in forks.materials] == ["elastic", "elastic", "phase_field"]
     assert {law_of(m, "named") for m in rock.materials} <= {"nacc", "elastic"}
     for scene, law in ((forks, "phase_field"), (rock, "nacc")):
