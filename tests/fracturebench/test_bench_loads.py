@@ -13,7 +13,7 @@ from gsfluent import ops
 from gsfluent.fracturebench.registry import find, judge
 from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.shapes import box, elastic, free, plane
-from gsfluent.lab.frozen.answer import rows, run_case, viscosity
+from gsfluent.lab.frozen.answer import law_of, rows, run_case, viscosity
 from gsfluent.lab.world.driver import World
 from gsfluent.pipeline.matter.brittle import softened
 
@@ -176,6 +176,24 @@ def test_a_row_that_yields_late_makes_its_points_viscous() -> None:
     rock = torch.from_numpy(scene.body) == 0
     assert (found[rock, 8] == 6e-6).all() and not found[~rock].any() and not found[:, :8].any()
     assert viscosity(scene, "phase_field") is None and viscosity(cube()) is None
+
+
+def test_matter_that_names_the_width_of_its_cracks_breaks_by_phase_field() -> None:
+    cases = [find(name) for name in ("branching", "rock_press")]
+    forks, rock = (case.build(case.ladder[0], 8) for case in cases)
+    assert [law_of(m, "named") for m in forks.materials] == ["elastic", "elastic", "phase_field"]
+    assert {law_of(m, "named") for m in rock.materials} <= {"nacc", "elastic"}
+    for scene, law in ((forks, "phase_field"), (rock, "nacc")):
+        for named, said in zip(rows(scene, "named"), rows(scene, law), strict=True):
+            assert torch.equal(named, said)
+    assert torch.equal(viscosity(rock, "named"), viscosity(rock))
+    assert viscosity(forks, "named") is None
+
+
+def test_where_nothing_touches_contact_at_points_changes_no_bit() -> None:
+    floor = plane(2, kind="slip")
+    nodes, points = (run_case(cube((floor,)), contact=name) for name in ("nodes", "points"))
+    assert np.array_equal(points.x, nodes.x) and np.array_equal(points.v, nodes.v)
 
 
 def test_strength_of_pressed_rock_rises_with_the_rate_because_of_its_row() -> None:

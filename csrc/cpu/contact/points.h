@@ -17,7 +17,11 @@ class TouchPlan {
     const SolverClock& c = *s_.clock;
     on_ = s_.object != nullptr && s_.radius != nullptr && contact_.any();
     if (!on_) return;
-    step_ = spring_step(s_);
+    const double step = spring_step(s_);
+    rows_.resize(s_.row_count);
+    for (int64_t row = 0; row < s_.row_count; ++row)
+      rows_[row] = {touch_matter(s_, row, step), spring_lag(row_wave(s_, row), double(s_.dx))};
+    near_.assign(c.slots, 0);
     first_.assign(c.slots * kBlockNodes, -1);
     push_.assign(c.slots * kBlockNodes * 4, T(0));
     given_.assign(4 * s_.count, T(0));
@@ -65,14 +69,17 @@ class TouchPlan {
   void run() {
     if (!on_) return;
     clear();
-    collect([&](const Item& item, int32_t slot, int32_t local) { add(item, slot, local); });
+    mark();
+    collect([&](int32_t slot, int32_t local) { return (near_[slot] >> local & 1) != 0; },
+            [&](const Item& item, int32_t slot, int32_t local) { add(item, slot, local); });
     push();
   }
   // The same in one rank of several: what its points are, with the numbers of its homes among those
   // of all, then what they get from the points of all, in the order of their homes.
   void offer(int32_t rank, const std::vector<int64_t>& homes, std::vector<Offer>& all) const {
     if (!on_) return;
-    collect([&](const Item& item, int32_t slot, int32_t local) {
+    const auto all_of_them = [](int32_t, int32_t) { return true; };  // others' points are elsewhere
+    collect(all_of_them, [&](const Item& item, int32_t slot, int32_t local) {
       const int32_t* b = s_.slot_coord + 4 * int64_t(slot);
       all.push_back({homes[item.home], block_key(b[0], b[1], b[2], b[3]), rank, local, item});
     });
@@ -93,6 +100,11 @@ class TouchPlan {
  private:
   static constexpr int64_t kCellGrain = 32;
 
+  // What the points of a row of materials have in common.
+  struct Row {
+    TouchMatter matter;
+    double lag;
+  };
   // Cell of a slot with such points.
   struct Cell {
     int32_t slot, local;
@@ -113,42 +125,76 @@ class TouchPlan {
       if (item.pushed && item.home >= 0) homes_[item.home] = 1;
   }
 
-  // The points near blocks that fields share, as f(item, slot, cell of it). They come in the order
-  // in which points are stored, which is one of their places and state.
+  // Calls f(home, point, its word, slot, cell of it) for the points near blocks that fields share.
   template <typename F>
-  void collect(const F& f) const {
-    const double dx = double(s_.dx);
+  void each_shared(const F& f) const {
     const HomeList<T>& list = s_.homes();
     for (int64_t h = 0; h < s_.clock->homes; ++h) {
       const uint32_t shared = ContactPlan<T>::readers(contact_.around_home(h));
       if (shared == 0) continue;
       const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
       const int64_t end = begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin);
-      const int32_t* b = list.coord + 4 * h;
       for (int64_t p = begin; p < end; ++p) {
         const uint32_t meta = s_.meta[p];
         if (!ContactPlan<T>::reads(shared, meta)) continue;
         int block = 0, local = 0;
-        Item item{};
-        item.point = static_cast<int32_t>(p);
-        item.home = static_cast<int32_t>(h);
         for (int axis = 0; axis < 3; ++axis) {
           const int cell = std::min(meta_cell(meta, axis), kLastCell) - 1;
           block = 3 * block + (cell >> 2) + 1;
           local = 4 * local + (cell & 3);
-          item.x[axis] = 4.0 * b[axis] + cell + 0.5 + double(s_.offset[3 * p + axis]);
-          item.v[axis] = double(s_.velocity[3 * p + axis]) / dx;
         }
         const int32_t slot = s_.neighbour[kNeighbours * h + block];
-        if (slot < 0 || slot >= s_.clock->slots) continue;
-        const uint32_t row = s_.row_of(meta);
-        const double radius = double(s_.radius[s_.id[p]]) / dx;
-        item.matter = touch_matter(s_, row, step_);
-        item.lag = spring_lag(row_wave(s_, row), dx);
-        item.share = touch_share(radius);
-        f(item, slot, local);
+        if (slot >= 0 && slot < s_.clock->slots) f(h, p, meta, slot, local);
       }
     }
+  }
+
+  // Which cells of slots lie beside cells with points of another object, as bits of near_.
+  void mark() {
+    std::fill(near_.begin(), near_.end(), 0);
+    filled_.assign(near_.size(), 0);
+    each_shared([&](int64_t, int64_t, uint32_t, int32_t slot, int32_t local) {
+      filled_[slot] |= uint64_t(1) << local;
+    });
+    for (size_t slot = 0; slot < filled_.size(); ++slot) {
+      if (filled_[slot] == 0) continue;
+      const int32_t own = s_.object[s_.slot_coord[4 * slot + 3]];
+      place(site_[slot]);
+      const int32_t* around = around_.data() + kNeighbours * int64_t(site_[slot]);
+      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1)
+        for (int o = 0; o < kNeighbours; ++o) {
+          int there;
+          const int32_t site = around[near_block(__builtin_ctzll(left), o, there)];
+          if (site < 0) continue;
+          const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
+          for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
+            if (s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] != own)
+              near_[slots[f]] |= uint64_t(1) << there;
+        }
+    }
+  }
+
+  // Those of them for which wanted(slot, cell), as f(item, slot, cell).
+  template <typename W, typename F>
+  void collect(const W& wanted, const F& f) const {
+    const double dx = double(s_.dx);
+    each_shared([&](int64_t h, int64_t p, uint32_t meta, int32_t slot, int32_t local) {
+      if (!wanted(slot, local)) return;
+      const int32_t* b = s_.homes().coord + 4 * h;
+      const Row& row = rows_[s_.row_of(meta)];
+      Item item{};
+      item.point = static_cast<int32_t>(p);
+      item.home = static_cast<int32_t>(h);
+      for (int axis = 0; axis < 3; ++axis) {
+        const int cell = std::min(meta_cell(meta, axis), kLastCell) - 1;
+        item.x[axis] = 4.0 * b[axis] + cell + 0.5 + double(s_.offset[3 * p + axis]);
+        item.v[axis] = double(s_.velocity[3 * p + axis]) / dx;
+      }
+      item.matter = row.matter;
+      item.lag = row.lag;
+      item.share = touch_share(double(s_.radius[s_.id[p]]) / dx);
+      f(item, slot, local);
+    });
   }
   void clear() {
     for (const Cell& cell : cells_) first_[int64_t(cell.slot) * kBlockNodes + cell.local] = -1;
@@ -251,11 +297,13 @@ class TouchPlan {
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
   bool on_ = false;
-  double step_ = 0.0;            // [s] for which springs are stable
-  std::vector<int32_t> first_;   // [slots, 64] first item of each cell, or -1
-  std::vector<int32_t> site_;    // [slots]
-  std::vector<uint64_t> key_;    // [sites] ascending
-  std::vector<int32_t> around_;  // [sites, 27] sites around one; -2: not looked for yet
+  std::vector<Row> rows_;         // [rows]
+  std::vector<uint64_t> near_;    // [slots] cells beside points of another object, as bits
+  std::vector<uint64_t> filled_;  // [slots] cells with points
+  std::vector<int32_t> first_;    // [slots, 64] first item of each cell, or -1
+  std::vector<int32_t> site_;     // [slots]
+  std::vector<uint64_t> key_;     // [sites] ascending
+  std::vector<int32_t> around_;   // [sites, 27] sites around one; -2: not looked for yet
   std::vector<Item> items_;
   std::vector<Cell> cells_;
   std::vector<T> given_;        // [N, 4]

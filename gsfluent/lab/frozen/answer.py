@@ -43,22 +43,34 @@ def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
     return phase_field.rows(material, at, torch.ones(1, dtype=torch.float64), dx)[0]
 
 
+def law_of(m: Mapping[str, Any], law: str = "nacc") -> str:
+    """The law by which a material of a scene moves.
+
+    Args:
+        m: The material.
+        law: Of what breaks: ``nacc``, ``phase_field``, or ``named``: the phase field for what names
+            the width of its cracks (``length``), NACC for what does not.
+    """
+    named = "phase_field" if "length" in m else "nacc"
+    return str(m["law"]) if m["law"] != "nacc" else named if law == "named" else law
+
+
 def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene.
 
     Args:
         scene: The scene.
-        law: Of what breaks: ``nacc`` or ``phase_field``.
+        law: Of what breaks, as of :func:`law_of`.
     """
     laws, params, alpha = [], [], []
     for m in scene.materials:
-        if m["law"] == "nacc" and law == "phase_field":
-            laws.append(LAWS[law])
+        name = law_of(m, law)
+        laws.append(LAWS[name])
+        if name == "phase_field":
             params.append(_phase_field(m, scene.dx))
             alpha.append(-1.0)
             continue
-        nacc = m["law"] == "nacc"
-        laws.append(LAWS[str(m["law"])])
+        nacc = name == "nacc"
         columns = (
             {
                 "c2": float(m["friction"]), "c3": float(m["cohesion"]),
@@ -82,10 +94,13 @@ def viscosity(scene: Scene, law: str = "nacc") -> torch.Tensor | None:
 
     Args:
         scene: The scene.
-        law: Of what breaks; ``phase_field`` has no yield.
+        law: Of what breaks, as of :func:`law_of`; the phase field has no yield.
     """
-    time = [float(m.get("yield_time", 0.0)) for m in scene.materials]
-    if law != "nacc" or not any(time):
+    time = [
+        float(m.get("yield_time", 0.0)) if law_of(m, law) == "nacc" else 0.0
+        for m in scene.materials
+    ]
+    if not any(time):
         return None
     found = torch.zeros((scene.count, 9), dtype=torch.float64)
     found[:, 8] = torch.tensor(time, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
@@ -159,7 +174,7 @@ def run_case(
         place: How far the points lie off their place on the grid [dx], along the axes that no
             collider looks along: a wall has to stay on its nodes. What is handed in does not move.
         method: Name in the record.
-        law: Of what breaks, ``nacc`` or ``phase_field``.
+        law: Of what breaks, as of :func:`law_of`.
         contact: What separating colliders and other bodies push: ``nodes`` or ``points``.
         watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         setup: ``setup(world)`` is called once before the first step; it may wrap ``world.force``.

@@ -116,27 +116,57 @@ def brittle_observer() -> Iterator[Result]:
     yield from compared("to a moving observer / at rest", moved, plain, 0.03, "Galilei")
 
 
+_PLACES = (("shifted", False), ("turned and shifted", True))
+"""Where else the balls lie: by part of a cell, and whether turned, too."""
+
+
+@functools.cache
+def _placed(radius: float, touch: bool) -> tuple[list[Outcome], dict[str, list[Outcome]]]:
+    """Impacts as they lie, and those that lie elsewhere."""
+    impact = functools.partial(brittle_impact, radius=radius, touch=touch)
+    moved = {
+        name: [impact(seed, shifted=True, turned=turned) for seed in SEEDS]
+        for name, turned in _PLACES
+    }
+    return [impact(seed) for seed in SEEDS], moved
+
+
+def _off(radius: float, touch: bool, name: str) -> tuple[float, float]:
+    """Mean loss and broken share there over those as they lie, less 1."""
+    plain, moved = _placed(radius, touch)
+    (one, _), (two, _) = mean(plain), mean(moved[name])
+    return two.lost / one.lost - 1.0, two.broken / one.broken - 1.0
+
+
 @problem(tier="fast")
 def brittle_placement() -> Iterator[Result]:
-    """Two brittle balls shifted by part of a cell, and turned, over eight placements."""
-    plain = [brittle_impact(seed) for seed in SEEDS]
-    shifted = [brittle_impact(seed, shifted=True) for seed in SEEDS]
-    turned = [brittle_impact(seed, shifted=True, turned=True) for seed in SEEDS]
-    source = "space has no places; the grid has"
-    yield from compared("shifted / as they lie", shifted, plain, 0.05, source)
-    yield from compared("turned and shifted / as they lie", turned, plain, 0.05, source)
+    """Two brittle balls that push by points, shifted by part of a cell and turned: energy lost."""
+    plain, moved = _placed(RADIUS, True)
+    for name, _ in _PLACES:
+        rows = compared(
+            f"{name} / as they lie, points push", moved[name], plain, 0.05,
+            "space has no places; the grid has",
+        )  # fmt: skip
+        energy = next(rows)
+        lost, broken = (1.0 + off for off in _off(RADIUS, False, name))
+        note = f"where nodes push {lost:.3f}, and {broken:.3f} of what broke"
+        yield dataclasses.replace(energy, note=f"{energy.note}; {note}")
 
 
 @problem(tier="slow")
 def brittle_placement_points() -> Iterator[Result]:
-    """The same on twice the cells, the points of the balls pushing each other."""
-    fine = functools.partial(brittle_impact, radius=FINE, touch=True)
-    plain = [fine(seed) for seed in SEEDS]
-    for what, turned in (("shifted", False), ("turned and shifted", True)):
-        moved = [fine(seed, shifted=True, turned=turned) for seed in SEEDS]
+    """The same on twice the cells, also what broke: there 4 cells are too few."""
+    plain, moved = _placed(FINE, True)
+    for name, _ in _PLACES:
         yield from compared(
-            f"{what} / as they lie, points push", moved, plain, 0.05,
+            f"{name} / as they lie, points push", moved[name], plain, 0.05,
             "space has no places; the grid has", FINE,
+        )  # fmt: skip
+        coarse, fine = (_off(radius, True, name)[1] for radius in (RADIUS, FINE))
+        yield compare(
+            f"what it breaks more or less, {name}, {FINE:g} cells over {RADIUS:g}",
+            abs(fine / coarse), tolerance=0.5, source="falls with dx",
+            note=f"{coarse:+.3f} and {fine:+.3f}",
         )  # fmt: skip
 
 
