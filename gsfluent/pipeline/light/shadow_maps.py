@@ -105,8 +105,8 @@ def shadow_maps(
 
     Lamps, ``faces`` and matter are what :meth:`gsfluent.pipeline.light.lamps.Lighting.drawn`,
     :func:`faces_of` and :func:`bulk` give; of siblings (``groups`` int32 [N]) only the nearest
-    shades. Mist shades nothing: its drops are finer than a texel, which would be all dark. Chips are
-    as fine as texels, and shade as much less as the map draws them larger.
+    shades. Mist shades nothing: its drops are finer than a texel, which would be all dark. Chips
+    are about a texel large, and shade as much less as the map draws them larger.
     """
     if not any(faces):
         return None
