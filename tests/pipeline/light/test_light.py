@@ -32,7 +32,7 @@ from gsfluent.pipeline.light.from_shot import (
     plates_of,
     transmission_of,
 )
-from gsfluent.pipeline.light.glass import as_seen, see_through
+from gsfluent.pipeline.light.glass import as_seen, on_a_face, see_through
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.normals import grid_for
 from gsfluent.pipeline.light.shade import irradiance, to_linear
@@ -516,6 +516,7 @@ def test_a_face_of_glass_is_as_opaque_as_its_angle_says(degrees: float) -> None:
     flat = torch.tensor([[0.01, 0.01, 0.001], [0.01, 0.01, 0.01], [0.01, 0.01, 0.001]])
     paint = torch.tensor([[0.2, 0.6, 0.4]]).expand(3, 3).contiguous()
     bare = Gaussians.from_colors(torch.zeros(3, 3), flat, paint, opacities=1.0)
+    assert on_a_face(bare).tolist() == [True, False, True]
     seen = see_through(bare, torch.tensor([0.8, 0.8, 0.0]), eye)
     mirror = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5  # Schlick, index 1.5
     pane = mirror + 0.2 * (1.0 - mirror)
