@@ -57,10 +57,13 @@ def bare_splats(particles: Particles, scene: Scene) -> Gaussians | None:
             drawn = ellipsoids(position, volume, free)
             size = CLOSED * volume.pow(1.0 / 3.0)
             lone = (_ALONE - drawn.scales[:, 0] / size).clamp(0.0, _ALONE - SPRAY_SIZE)
-            sizes = torch.lerp(torch.ones_like(size), _drops(size), lone / (_ALONE - SPRAY_SIZE))
+            lone = lone / (_ALONE - SPRAY_SIZE)
+            drops = _drops(size, max(TENSION / edge, 1.0) if edge > 0.0 else 1.0)
+            none = drops == 0.0
+            sizes = torch.lerp(torch.ones_like(size), drops.clamp(min=_SMALLEST), lone)
             made = _splats(drawn.means, drawn.scales * sizes[:, None], paint)
             share = _OPACITY.get(body.material.name.split(".")[-1], _OPAQUE)
-            opacities = torch.full_like(made.opacities, share)
+            opacities = share * torch.where(none, 1.0 - lone, 1.0).to(made.opacities)
             mist = (lone > 0.0) & (volume < TENSION**3)
             labels = torch.where(mist, SPRAY, SURFACE).to(torch.int32)
             groups.append(made.replace(quats=drawn.quats, opacities=opacities, labels=labels))
@@ -75,16 +78,22 @@ def _stands(particles: Particles, scene: Scene) -> Tensor:
     return torch.tensor(stands, device=particles.body.device)[particles.body.long()]
 
 
-def _drops(like: Tensor) -> Tensor:
-    """Sizes of drops over that of their mean volume, each its own for good.
+def _drops(like: Tensor, coarse: float = 1.0) -> Tensor:
+    """Sizes of drops over that of their mean volume, each its own for good; 0 for no drop.
 
     What tears into drops of one size by its points does not in life: volumes are exponentially
-    distributed, the simplest of the laws that a ligament's drops obey (Villermaux 2007).
+    distributed, the simplest of the laws that a ligament's drops obey (Villermaux 2007). Nor are
+    they as fine as the points: of those that tension draws together one is drawn for all.
+
+    Args:
+        like: One value a point, [N].
+        coarse: Mean size of the drops over that of the points.
     """
     number = torch.arange(like.shape[0], device=like.device)
-    share = 0.5 + 0.5 * ops.hashes(number, [0])[:, 0]
+    share, drawn = (0.5 + 0.5 * ops.hashes(number, [0, 1])).unbind(dim=1)
     volume = -torch.log(share.clamp(min=1e-9))
-    return volume.pow(1.0 / 3.0).clamp(_SMALLEST, _LARGEST).to(like)
+    size = coarse * volume.pow(1.0 / 3.0).clamp(_SMALLEST, _LARGEST)
+    return torch.where(drawn < coarse**-3, size, 0.0).to(like)
 
 
 def bare_points(particles: Particles, scene: Scene) -> Tensor:

@@ -42,12 +42,12 @@ from gsfluent.pipeline.cracks.followers import (
     motions,
     neighbours,
     parted,
-    stiff,
 )
 from gsfluent.pipeline.cracks.gaps import Births, Cracks, Gaps
 from gsfluent.pipeline.cracks.torn import Shares, Sides, Torn, flows_at
 from gsfluent.pipeline.matter.carry import BLEND, Carry, Points
 from gsfluent.pipeline.matter.fragments import components
+from gsfluent.pipeline.matter.pieces import stiff
 from gsfluent.pipeline.matter.points import body_frame
 from gsfluent.pipeline.partition.roughness import amplitude, relief
 from gsfluent.pipeline.partition.splits import Split, Splits

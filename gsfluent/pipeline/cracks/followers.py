@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.materials import Material
 from gsfluent.pipeline.matter.links import PARTED, Links
 from gsfluent.pipeline.matter.points import Matter
 from gsfluent.pipeline.partition.threshold import CHIP
@@ -26,8 +25,6 @@ MOST = 0.9
 STRAY, ROUNDS = 1.5, 3
 """Way [spacings] from which on a point of something stiff has strayed from its chunk, and how often
 these are left out anew."""
-STIFF = 3e-3
-"""Strain at which a material breaks below which its pieces are never seen to bend."""
 _FINE = 2.0**20
 
 
@@ -182,14 +179,6 @@ def chips(chunk: Tensor, there: Tensor, drive: Tensor, count: int, first: int) -
     driven = torch.zeros_like(chip)
     driven[chunk[drive]] = True
     return chip & driven
-
-
-def stiff(material: Material) -> bool:
-    """Whether nobody sees a piece of a material bend: glass, china, shell, stone.
-
-    What is simulated is softer for the sake of longer steps, and bends before it breaks.
-    """
-    return material.failure_strain / material.softening**0.5 < STIFF
 
 
 class Motions(NamedTuple):

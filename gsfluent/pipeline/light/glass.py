@@ -19,7 +19,7 @@ _FACE_ON = 0.04  # reflected straight on by an index of 1.5
 _STUDIO = 0.92  # display value of what is reflected
 # Splats of a skin that a ray meets at one crossing: together they are as opaque as one pane.
 _OVERLAP = 3.0
-# A splat this much thinner than wide lies on a face; the others fill the inside.
+# A splat this much thinner than wide lies on a face.
 _FLAT = 0.5
 _LOST = 0.7  # of a highlight's display value, on a body that is all clear
 
@@ -40,6 +40,12 @@ def as_seen(
     return seen, gloss
 
 
+def on_a_face(gaussians: Gaussians) -> Tensor:
+    """Splats so flat that they lie on a face of a body, bool [N]; the others fill its inside."""
+    thin, middle, _ = gaussians.scales.sort(dim=1).values.unbind(1)
+    return thin < _FLAT * middle
+
+
 def see_through(gaussians: Gaussians, clear: Tensor, eye: Tensor) -> Gaussians:
     """The splats as they are seen from ``eye``.
 
@@ -57,8 +63,7 @@ def see_through(gaussians: Gaussians, clear: Tensor, eye: Tensor) -> Gaussians:
     mirror = _FACE_ON + (1.0 - _FACE_ON) * (1.0 - facing) ** 5
     tint = (1.0 - clear) * (1.0 - mirror)
     pane = mirror + tint
-    thin, middle, _ = gaussians.scales.sort(dim=1).values.unbind(1)
-    face = thin < _FLAT * middle
+    face = on_a_face(gaussians)
     share = torch.where(face, 1.0 - (1.0 - pane) ** (1.0 / _OVERLAP), (1.0 - clear) ** 2)
     there = clear > 0.0
     opacities = torch.where(there, gaussians.opacities * share, gaussians.opacities)

@@ -53,6 +53,8 @@ _BULK = 3.0
 _NEAR = 1e-4
 # Shortest over longest axis up to which a grain is one of the sides of a chip, and no mist.
 _PLATE = 0.5
+# What a picture adds to the variances of a splat, in texels squared.
+_BLUR = 0.3
 
 
 class Bulk(NamedTuple):
@@ -103,16 +105,12 @@ def shadow_maps(
 
     Lamps, ``faces`` and matter are what :meth:`gsfluent.pipeline.light.lamps.Lighting.drawn`,
     :func:`faces_of` and :func:`bulk` give; of siblings (``groups`` int32 [N]) only the nearest
-    shades. Grains of a spray shade nothing: they are finer than a texel, which would be all dark.
+    shades. Mist shades nothing: its drops are finer than a texel, which would be all dark. Chips
+    are about a texel large, and shade as much less as the map draws them larger.
     """
     if not any(faces):
         return None
-    opacities = gaussians.opacities
-    if gaussians.labels is not None:
-        short, long = gaussians.scales.aminmax(dim=1)
-        mist = (gaussians.labels == SPRAY) & (short > _PLATE * long)
-        opacities = torch.where(mist, 0.0, opacities)
-    rows = []
+    rows, texels = [], []
     for lamp, count in zip(lamps, faces, strict=True):
         if count == 0:
             continue
@@ -120,8 +118,10 @@ def shadow_maps(
             views, focal, near = _directional(lamp, matter, size)
         else:
             views, focal, near = _point(lamp.position, count, matter, size)
-        bias = _BIAS_SPLATS * matter.size + _BIAS_TEXELS * (near + matter.radius) / focal
+        texels.append((near + matter.radius) / focal)
+        bias = _BIAS_SPLATS * matter.size + _BIAS_TEXELS * texels[-1]
         rows += [_row(view, focal, near, bias, size) for view in views]
+    opacities = _shading(gaussians, math.fsum(texels) / len(texels))
     # one transfer: each costs more than the little that is in it
     table = torch.stack(rows).to(gaussians.means)
     cameras, intrinsics, bottom = table.split((MAP, 9, 4), 1)
@@ -143,6 +143,21 @@ def shadow_maps(
     # Looked up beyond a map is its border: a grain that flew there would shade all behind it.
     alpha = functional.pad(seen.alpha[:, 1:-1, 1:-1], (1, 1, 1, 1))
     return ShadowMaps(seen.depth, alpha, cameras)
+
+
+def _shading(gaussians: Gaussians, texel: float) -> Tensor:
+    """Opacities [N] of the splats in maps with texels [m] of this size at the matter."""
+    if gaussians.labels is None:
+        return gaussians.opacities
+    short, long = gaussians.scales.aminmax(dim=1)
+    wide = geometry.product(gaussians.scales) / (short * long).clamp(min=1e-30)
+    blur = _BLUR * texel * texel
+    share = long * wide / ((long * long + blur) * (wide * wide + blur)).sqrt()
+    # light has to pass the front of a chip and its back, which shade together as much as they hide
+    opaque = gaussians.opacities
+    both = 1.0 - (1.0 - share * opaque * (2.0 - opaque)).clamp(min=0.0).sqrt()
+    grains = torch.where(short > _PLATE * long, 0.0, both)
+    return torch.where(gaussians.labels == SPRAY, grains, opaque)
 
 
 def _row(view: Tensor, focal: float, near: float, bias: float, size: int) -> Tensor:

@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = room(
     fields="LIMIT MOST breakable cut_bodies number_fields",
     fragments="Fragments components ranked rest_links",
     links="BACK FULL Hanging Links NEIGHBOURS OPEN PARTED",
-    pieces="Pieces Web dust_limit find_pieces",
+    pieces="Pieces Web dust_limit find_pieces stiff",
     points=(
         "ALPHA_JITTER MAX_PARTICLES Matter POINTS_PER_CELL body_frame build_matter "
         "grid_spacing sample_points select shared_out start_of"

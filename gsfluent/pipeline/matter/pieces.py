@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gsfluent import ops
+from gsfluent.materials import Material
 from gsfluent.ops.blade import cut_apart
 from gsfluent.ops.graph import FAR_KEY
 from gsfluent.pipeline.matter.fragments import DEBRIS, Fragments, mass_shares, ranked, weigh
@@ -43,7 +44,17 @@ NEAR = 1.5
 REACH = 3.0
 """Point spacings from a piece's points within which dust beyond the bound joins it: the reach of
 the kernel."""
+STIFF = 3e-3
+"""Strain at which a material breaks below which its pieces are never seen to bend."""
 _FINE = 2.0**20
+
+
+def stiff(material: Material) -> bool:
+    """Whether nobody sees a piece of a material bend: glass, china, shell, stone.
+
+    What is simulated is softer for the sake of longer steps, and bends before it breaks.
+    """
+    return material.failure_strain / material.softening**0.5 < STIFF
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +71,8 @@ class Web:
         may_break: Bodies that can break, or that a blade has touched, bool [bodies].
         dust: Share of a body's mass that may be dust where a piece is one spacing large,
             float64 [bodies]; see :func:`dust_limit`.
+        stiff: Bodies of which no piece bends, bool [bodies]; see :func:`stiff`. A crack through
+            one is not held together by a neck, nor by what was welded: that would be a hinge.
     """
 
     links: Tensor
@@ -70,6 +83,7 @@ class Web:
     flowing: Tensor
     may_break: Tensor
     dust: Tensor
+    stiff: Tensor
 
     @functools.cached_property
     def length(self) -> Tensor:
@@ -119,6 +133,12 @@ class Web:
         rows = torch.arange(self.body.shape[0], device=self.body.device)
         first = torch.full_like(self.may_break, len(rows), dtype=torch.int64)
         return first.scatter_reduce(0, self.body, rows, "amin")[self.body]
+
+    def hurt_by(self, broken: Tensor) -> Tensor:
+        """Points that are broken, or linked to one that is, bool [N]."""
+        a, b = self.links[self.fixed].unbind(dim=1)
+        hurt = broken.index_fill(0, a[broken[b]], True)
+        return hurt.index_fill(0, b[broken[a]], True)
 
     def check(self) -> None:
         """Raise a ValueError where a shape does not match or a link names no point."""
@@ -207,8 +227,9 @@ def find_pieces(
 
     here = split[body]
     whole = here & ~broken & ~web.flowing
-    root = ops.components(web.links, count, apart=cut, inside=whole)
     enough = torch.minimum(torch.full_like(size, least), (size + 1) // 2)[body]
+    whole = _firm(web, whole, broken if ever is None else ever, cut, enough)
+    root = ops.components(web.links, count, apart=cut, inside=whole)
     fresh = (whole if ever is None else whole & ~ever).nonzero()[:, 0]
     seed = whole & (torch.bincount(root[fresh], minlength=count)[root] >= enough)
     name = root.new_full((count,), count).scatter_reduce(0, root[fresh], fresh, "amin")
@@ -272,6 +293,33 @@ def _length(a: Tensor, b: Tensor) -> Tensor:
     """Distances [m], float64: one operation at a time, which rounds alike on every device."""
     x, y, z = (a.double() - b.double()).unbind(dim=1)
     return (x * x + y * y + z * z).sqrt()
+
+
+def _firm(web: Web, whole: Tensor, ever: Tensor, cut: Tensor, enough: Tensor) -> Tensor:
+    """Whole points, less the necks of what is stiff.
+
+    Where two parts with enough points each hang together only by points that broke once, or by such
+    as lie beside one, all of those go: they hold two halves at an angle, as a hinge does.
+
+    Args:
+        web: What hangs together at rest.
+        whole: Points that are not broken now, bool [N].
+        ever: Points that broke once, bool [N].
+        cut: Links that do not count, bool [L].
+        enough: Points of a part, int64 [N].
+    """
+    own = web.stiff[web.body] & whole
+    if not bool(own.any()):
+        return whole
+    count = len(whole)
+    root = ops.components(web.links, count, apart=cut, inside=own)
+    core = own & ~web.hurt_by(ever)
+    part = ops.components(web.links, count, apart=cut, inside=core)
+    size = torch.bincount(part[core], minlength=count)
+    first = core & (part == torch.arange(count, device=part.device)) & (size >= enough)
+    parts = torch.bincount(root[first], minlength=count)
+    neck = own & (parts[root] >= 2) & ~(core & (size[part] >= enough))
+    return whole & ~neck
 
 
 def _nearest_seed(web: Web, unit: Tensor, seed: Tensor, other: Tensor, cost: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from gsfluent.io import load_capture, load_splats
 from gsfluent.io.solid import load_solid
 from gsfluent.pipeline.light.albedo import Albedo
 from gsfluent.pipeline.light.from_shot import clear_of, gloss_of, plates_of, transmission_of
-from gsfluent.pipeline.light.glass import as_seen
+from gsfluent.pipeline.light.glass import as_seen, on_a_face
 from gsfluent.pipeline.light.lamps import Lighting
 from gsfluent.pipeline.light.normals import occupancy_cell
 from gsfluent.pipeline.light.wetness import Wetness, wet_colors, wet_gloss
@@ -127,18 +127,20 @@ class Film:
     ) -> Picture:
         """The picture of splats at the moment of a frame, in any camera."""
         gloss, clear = gloss_of(self.shot, frame), transmission_of(self.shot, frame)
+        plates = plates_of(frame)
         shown, wet = gaussians, self._wetness.at(frame)
         if wet is not None:
             shown = wet_colors(shown, wet)
             gloss = None if gloss is None else wet_gloss(gloss, wet)
         if clear is not None:
             shown, gloss = as_seen(shown, gloss, clear, camera)
+            plates = plates | ((clear > 0.0) & on_a_face(shown))
         made = self.render(
             shown,
             camera,
             groups=frame.groups,
             gloss=gloss,
-            plates=plates_of(frame),
+            plates=plates,
             rigid=frame.anchor < 0,
             backdrop=self.backdrop,
             time=frame.time,

@@ -20,7 +20,7 @@ from gsfluent.pipeline.liquid.nozzle import pours
 from gsfluent.pipeline.matter.carry import STRETCH
 from gsfluent.pipeline.matter.fields import breakable, cut_bodies
 from gsfluent.pipeline.matter.fragments import Fragments, rest_links
-from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces
+from gsfluent.pipeline.matter.pieces import Pieces, Web, find_pieces, stiff
 from gsfluent.pipeline.matter.points import POINTS_PER_CELL, Matter
 from gsfluent.pipeline.matter.state import State, load_state, save_state
 from gsfluent.pipeline.matter.weld import seen, weld
@@ -98,6 +98,7 @@ class Run:
         device = matter.particles.device
         shares = [body.material.dust for body in scene.bodies]
         self._dust = torch.tensor(shares, dtype=torch.float64, device=device)
+        self._stiff = torch.tensor([stiff(body.material) for body in scene.bodies], device=device)
         self._spacing = torch.tensor(matter.spacing, dtype=torch.float64, device=device)
         self._whole: Web | None = None
 
@@ -201,7 +202,7 @@ class Run:
             p = self.matter.particles
             self._whole = Web(
                 self.links, self.matter.rest, p.body.long(), self._spacing, p.mass, self._flowing,
-                self._breakable, self._dust,
+                self._breakable, self._dust, self._stiff,
             )  # fmt: skip
         if self.scene.blades:
             may_break = self._breakable | cut_bodies(self.matter, state.cut)

@@ -19,6 +19,7 @@ from gsfluent.config import Shot
 from gsfluent.data import SPRAY, SURFACE, Camera, Gaussians
 from gsfluent.errors import InputError
 from gsfluent.lab.truth import light as truth
+from gsfluent.pipeline.fill.skin import facing
 from gsfluent.pipeline.light import environment
 from gsfluent.pipeline.light.albedo import Albedo, estimate_shading, to_albedo
 from gsfluent.pipeline.light.bake import bake_light
@@ -31,12 +32,12 @@ from gsfluent.pipeline.light.from_shot import (
     plates_of,
     transmission_of,
 )
-from gsfluent.pipeline.light.glass import as_seen, see_through
+from gsfluent.pipeline.light.glass import as_seen, on_a_face, see_through
 from gsfluent.pipeline.light.lamps import Lamp, Lighting, key_light, pack_lamps, studio_light
 from gsfluent.pipeline.light.normals import grid_for
 from gsfluent.pipeline.light.shade import irradiance, to_linear
 from gsfluent.pipeline.light.shadow import FADE, NORMAL_OFFSET, ShadowMaps, transmittance
-from gsfluent.pipeline.light.shadow_maps import bulk, faces_of, shadow_maps
+from gsfluent.pipeline.light.shadow_maps import Bulk, bulk, faces_of, shadow_maps
 from gsfluent.pipeline.render.stage import Render
 from gsfluent.pipeline.render.studio import Studio
 from gsfluent.results.frames import DUST
@@ -144,6 +145,29 @@ def test_mist_shades_nothing_and_chips_do(skin: Gaussians) -> None:
     for shading in (mist.labelled(0), sides):
         maps = shadow_maps(Gaussians.cat([skin, shading]), lamps, faces, 128, matter)
         assert maps is not None and not torch.equal(maps.alpha, alone.alpha)
+
+
+@pytest.mark.parametrize("radius", [0.8, 1.6, 3.2])
+def test_a_chip_shades_about_its_own_outline_however_fine_it_is(radius: float) -> None:
+    """``radius`` in texels: a map draws what is small larger, and light passes two sides."""
+    texel = 2.3 / 128  # of a scene of radius 1
+    number = torch.arange(24) + 0.5
+    height, angle = 1.0 - number / 12, 2.39996 * number
+    ring = (1.0 - height * height).sqrt()
+    normal = torch.stack([ring * angle.cos(), ring * angle.sin(), height], 1)
+    wide = 0.47 * radius * texel * math.sqrt(4.0 * math.pi / 24)
+    chip = Gaussians.from_colors(
+        radius * texel * normal, torch.tensor([wide, wide, 0.22 * wide]).repeat(24, 1),
+        torch.ones(24, 3), opacities=0.97, label=SPRAY, quats=facing(normal),
+    )  # fmt: skip
+    lamps, matter = (Lamp(direction=(0.0, 0.0, 1.0)),), Bulk((0.0, 0.0, 0.0), 1.0, 1e-3)
+    areas = []
+    for shown in (chip, chip.labelled(SURFACE)):
+        maps = shadow_maps(shown, lamps, faces_of(lamps, matter), 128, matter)
+        assert maps is not None
+        areas.append(float(maps.alpha.sum()) / (math.pi * radius**2))
+    assert 0.8 < areas[0] < 2.2
+    assert areas[0] < areas[1]
 
 
 def test_what_flew_onto_the_border_of_a_map_shades_nothing_beyond(skin: Gaussians) -> None:
@@ -492,6 +516,7 @@ def test_a_face_of_glass_is_as_opaque_as_its_angle_says(degrees: float) -> None:
     flat = torch.tensor([[0.01, 0.01, 0.001], [0.01, 0.01, 0.01], [0.01, 0.01, 0.001]])
     paint = torch.tensor([[0.2, 0.6, 0.4]]).expand(3, 3).contiguous()
     bare = Gaussians.from_colors(torch.zeros(3, 3), flat, paint, opacities=1.0)
+    assert on_a_face(bare).tolist() == [True, False, True]
     seen = see_through(bare, torch.tensor([0.8, 0.8, 0.0]), eye)
     mirror = 0.04 + 0.96 * (1.0 - math.cos(angle)) ** 5  # Schlick, index 1.5
     pane = mirror + 0.2 * (1.0 - mirror)

@@ -7,11 +7,13 @@ import torch
 from torch import Tensor
 
 from gsfluent import materials
+from gsfluent.data import Particles
 from gsfluent.geometry import covariance, quaternion_to_matrix
-from gsfluent.pipeline.colliders.splats import _drops
-from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, TORN, ellipsoids
+from gsfluent.pipeline.colliders.splats import _drops, bare_splats
+from gsfluent.pipeline.liquid.sheet import CLOSED, FILM, RATIO, SPRAY, TENSION, TORN, ellipsoids
 from gsfluent.pipeline.liquid.spacing import apart
 from gsfluent.pipeline.liquid.tearing import WETS, in_air, tears
+from gsfluent.scene.scene import Scene
 from gsfluent.spatial.blue_noise import blue_cylinder
 from gsfluent.spatial.neighbours import nearest_rows
 
@@ -162,3 +164,19 @@ def test_drops_have_sizes_of_their_own() -> None:
     assert float(sizes.min()) > 0.3 and float(sizes.max()) < 1.7
     assert float(sizes.pow(3).mean()) == pytest.approx(1.0, abs=0.05)
     assert float(sizes.std()) > 0.2
+
+
+def test_fine_points_alone_make_fewer_and_larger_drops() -> None:
+    scene = Scene(floor=None)
+    scene.pour((0.0, 0.0, 0.1), 1.0, 0.01, volume=1e-5, material="milk")
+    edge = TENSION / 3.0
+    position = 0.1 * torch.rand(20000, 3, generator=torch.Generator().manual_seed(1))
+    volume = torch.full((20000,), edge**3)
+    particles = Particles.at_rest(position, mass=1e3 * volume, volume=volume)
+    drawn = bare_splats(particles, scene)
+    assert drawn is not None
+    drops = drawn.opacities > 0.9
+    assert float(drops.float().mean()) == pytest.approx(1.0 / 27.0, rel=0.1)
+    seen = (drawn.scales[drops] / (SPRAY * CLOSED)).prod(dim=1)
+    assert float(drawn.opacities[~drops].mean()) < 0.02
+    assert float(seen.sum()) == pytest.approx(20000 * edge**3, rel=0.1)

@@ -14,14 +14,15 @@ from gsfluent.pipeline.matter.pieces import Pieces, Web, dust_limit, find_pieces
 
 
 def web_of(
-    rest: Tensor, links: Tensor, *, dust: float = 1.0, mass: Tensor | None = None, h: float = 1.0
-) -> Web:
+    rest: Tensor, links: Tensor, *, dust: float = 1.0, mass: Tensor | None = None, h: float = 1.0,
+    stiff: bool = False,
+) -> Web:  # fmt: skip
     """One body that can break."""
     count = rest.shape[0]
     return Web(
         links, rest, torch.zeros(count, dtype=torch.int64), torch.tensor([h]).double(),
         torch.ones(count) if mass is None else mass, torch.zeros(count, dtype=torch.bool),
-        torch.tensor([True]), torch.tensor([dust]).double(),
+        torch.tensor([True]), torch.tensor([dust]).double(), torch.tensor([stiff]),
     )  # fmt: skip
 
 
@@ -253,3 +254,25 @@ def test_bad_links_are_refused() -> None:
     none = torch.zeros(3, dtype=torch.bool)
     with pytest.raises(ValueError, match="cut_links must have 2 rows"):
         find_pieces(web, web.rest, none, none)
+
+
+def bar(stiff: bool) -> tuple[Web, Tensor]:
+    """A bar of 6 x 6 x 24 points, and its crack: all across but for a neck of three points."""
+    axis = torch.arange(6.0)
+    rest = torch.cartesian_prod(axis, axis, torch.arange(24.0))
+    web = web_of(rest, rest_links(rest, ((0, len(rest)),), (1.0,)), stiff=stiff)
+    across = (rest[:, 2] > 10.5) & (rest[:, 2] < 12.5)
+    neck = across & (rest[:, 0] < 1) & (rest[:, 1] < 3)
+    return web, across & ~neck
+
+
+@pytest.mark.parametrize("welded", [False, True])
+@pytest.mark.parametrize("stiff", [False, True])
+def test_no_neck_holds_what_is_stiff(stiff: bool, welded: bool) -> None:
+    web, crack = bar(stiff)
+    # of a body in which nothing is broken any more nothing is asked
+    end = web.rest[:, 2] > 22.5
+    cut = torch.zeros(len(web.links), dtype=torch.bool)
+    found = find_pieces(web, web.rest, end if welded else crack | end, cut, ever=crack | end)
+    assert found.fragments.count == (2 if stiff else 1)
+    assert not bool(found.dust.any())

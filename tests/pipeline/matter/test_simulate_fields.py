@@ -82,6 +82,7 @@ def pieces_of(matter: Matter, broken: Tensor, position: Tensor) -> Pieces:
     web = Web(
         links, matter.rest, p.body.long(), torch.tensor(matter.spacing).double(), p.mass,
         matter.of_law("fluid", "drucker_prager"), breakable(matter), torch.tensor([0.5]).double(),
+        torch.tensor([False]),
     )  # fmt: skip
     return find_pieces(web, position, broken, torch.zeros(len(links), dtype=torch.bool))
 

@@ -44,6 +44,7 @@ def halves(gap: float = 1.0) -> tuple[Matter, Web, State, Pieces]:
     web = Web(
         links, matter.rest, p.body.long(), torch.tensor(matter.spacing).double(), p.mass,
         torch.zeros_like(layer), breakable(matter), torch.ones(1).double(),
+        torch.zeros(1, dtype=torch.bool),
     )  # fmt: skip
     pieces = find_pieces(web, position, state.peak >= 0, state.cut_links)
     assert pieces.fragments.count == 2
