@@ -1,6 +1,6 @@
 """Containers: what flows between the stages. They hold tensors and check their shapes."""
 
-from gsfluent.data.camera import Camera
+from gsfluent.data.camera import Camera, projected
 from gsfluent.data.capture import Capture, View
 from gsfluent.data.frame import Frame
 from gsfluent.data.gaussians import (
@@ -27,4 +27,5 @@ __all__ = [
     "Particles",
     "Solid",
     "View",
+    "projected",
 ]

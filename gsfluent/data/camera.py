@@ -105,23 +105,7 @@ class Camera:
         Points behind the camera get a negative depth; their pixels mean nothing. Radial and
         tangential model: OpenCV, "Camera Calibration and 3D Reconstruction".
         """
-        local = points.to(self.viewmat) @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
-        depth = local[:, 2]
-        safe = torch.where(depth.abs() > 1e-12, depth, torch.full_like(depth, 1e-12))
-        x, y = local[:, 0] / safe, local[:, 1] / safe
-        if self.distortion:
-            k1, k2, p1, p2, k3, k4, k5, k6 = (
-                *self.distortion,
-                *([0.0] * (8 - len(self.distortion))),
-            )
-            r2 = x * x + y * y
-            radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-            x, y = (
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            )
-        pixels = torch.stack([x, y, torch.ones_like(x)], dim=1) @ self.K.T
-        return pixels[:, :2], depth
+        return projected(points.to(self.viewmat), self.viewmat, self.K, self.distortion)
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the camera of the same view at another image size; each axis scales on its own."""
@@ -154,3 +138,33 @@ class Camera:
             viewmat=self.viewmat.to(device=device, dtype=dtype),
             K=self.K.to(device=device, dtype=dtype),
         )
+
+
+def projected(
+    points: Tensor, viewmat: Tensor, K: Tensor, distortion: Sequence[float] = ()
+) -> tuple[Tensor, Tensor]:
+    """As :meth:`Camera.project`, where the camera is two matrices on the device of the points.
+
+    Args:
+        points: World points [N, 3].
+        viewmat: World to camera, [4, 4], of the same dtype.
+        K: Intrinsics [px], [3, 3].
+        distortion: Of the lens, as :class:`Camera` has it.
+    """
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = local[:, 2]
+    safe = torch.where(depth.abs() > 1e-12, depth, torch.full_like(depth, 1e-12))
+    x, y = local[:, 0] / safe, local[:, 1] / safe
+    if distortion:
+        k1, k2, p1, p2, k3, k4, k5, k6 = (
+            *distortion,
+            *([0.0] * (8 - len(distortion))),
+        )
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        )
+    pixels = torch.stack([x, y, torch.ones_like(x)], dim=1) @ K.T
+    return pixels[:, :2], depth

@@ -549,6 +549,10 @@ def _check_number(name: str, field: str, value: Any, low: float, high: float, un
         raise InputError(
             f"{where} must be a number or a tensor, got {type(value).__name__}", hint=f"give {unit}"
         )
+    if not isinstance(value, Tensor):  # without a tensor: presets hold thousands of numbers
+        above = value > 0.0 or field not in POSITIVE
+        if above and low <= value <= high and math.isfinite(value):
+            return
     data = _tensor(value)
     if data.ndim not in (0, 3):
         raise InputError(

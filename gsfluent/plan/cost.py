@@ -30,7 +30,7 @@ from gsfluent.io import write_json
 
 _log = logging.getLogger(__name__)
 
-FORMAT = 1
+FORMAT = 2
 """Of the stored file; another number is another model."""
 LAW_SETS = ("elastic", "nacc", "general")
 """Sets of laws for which the solver has kernels of their own."""
@@ -110,9 +110,6 @@ class CostModel:
     ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     # The same for memory.
     memory_ratios: dict[str, list[float]] = dataclasses.field(default_factory=dict)
-    # Stage, feature: bytes per unit, where the probe could measure them (on a GPU, whose allocator
-    # counts exactly).
-    memory: dict[str, dict[str, float]] = dataclasses.field(default_factory=dict)
 
     @classmethod
     def unmeasured(cls, device: torch.device | str) -> CostModel:
@@ -141,7 +138,7 @@ class CostModel:
         if known is None:
             raise ValueError(f"CostModel: no stage {name!r}; known: {', '.join(self.seconds)}")
         seconds = sum(value * features.get(feature, 0.0) for feature, value in known.items())
-        size = memory_of(name, features, self.device, self.memory.get(name))
+        size = memory_of(name, features, self.device)
         if corrected:
             seconds *= self.correction(name)
             size = int(size * _mean_ratio(self.memory_ratios.get(name, [])))
@@ -241,7 +238,6 @@ class CostModel:
             errors=_numbers(values["errors"]),
             ratios={name: _ratios(row) for name, row in values["ratios"].items()},
             memory_ratios={name: _ratios(row) for name, row in values["memory_ratios"].items()},
-            memory={name: _numbers(row) for name, row in values["memory"].items()},
         )
         if not model.seconds:
             raise ValueError("no stage in it")
@@ -352,28 +348,24 @@ BYTES: dict[str, dict[str, dict[str, float]]] = {
         "export": {"start": 450e6, "gaussians": 688.0},
     },
     "cuda": {
-        "reconstruct": {"start": 20e6, "source_pixels": 16.0, "splats_most": 1000.0},
-        "isolate": {"splats": 264.0},
-        "fill": {"start": 20e6, "voxels_most": 100.0, "inner_most": 1000.0},
-        "texture": {"start": 20e6, "volume_most": 200.0},
-        "simulate": {"start": 20e6, "gaussians": 1050.0, "points": 1000.0, "blocks_most": 9000.0},
-        "render": {"start": 20e6, "gaussians": 688.0, "pixels": 300.0},
-        "export": {"start": 20e6, "gaussians": 688.0},
+        "reconstruct": {"start": 150e6, "source_pixels": 16.0, "splats_most": 3000.0},
+        "isolate": {"start": 256e6},
+        "fill": {"start": 335e6, "inner_most": 1930.0},
+        "texture": {"start": 570e6, "volume_most": 490.0},
+        "simulate": {"start": 400e6, "points": 3270.0, "born": 2020.0},
+        "render": {"start": 220e6, "gaussians": 1310.0, "pixels": 715.0},
+        "export": {"start": 220e6, "gaussians": 1310.0},
     },
 }
-"""``cpu``: fitted to six gallery shots, each in a process of its own (scripts/study/shots/plan.py
---fit-memory); residuals are 5 % in the median, 20 % at most. What those shots are too small to show
-is counted from the tensors: training state of a splat (``splats_most``), the solver's buffers of a
-block (``blocks_most``, gsfluent/ops/solver_buffers.py). ``cuda``: counted from tensors, and taken
-only until the probe has measured the machine."""
+"""Fitted to shots of the gallery: what they take hangs on the work, not on the machine. ``cpu``: to
+six at ``preview``, each in a process of its own (scripts/study/shots/plan.py --fit-memory);
+residuals are 5 % in the median, 20 % at most. What those are too small to show is counted from the
+tensors: training state of a splat (``splats_most``), the solver's buffers of a block
+(``blocks_most``, gsfluent/ops/solver_buffers.py). ``cuda``: to ten at ``hero`` and the demo, 22 k
+to 1.8 M points on an H200; the simulation is 23 % off at most when its shot is left out."""
 
 
-def memory_of(
-    stage: str,
-    features: Mapping[str, float],
-    device: str,
-    measured: Mapping[str, float] | None = None,
-) -> int:
-    """Most memory of a stage [bytes]; ``measured``: per unit on this machine, for BYTES."""
-    rows = measured or BYTES[device].get(stage, {})
+def memory_of(stage: str, features: Mapping[str, float], device: str) -> int:
+    """Most memory of a stage [bytes]."""
+    rows = BYTES[device].get(stage, {})
     return int(sum(value * features.get(name, 0.0) for name, value in rows.items()))

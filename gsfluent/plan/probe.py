@@ -27,7 +27,7 @@ from gsfluent.io import load_capture, save_image
 from gsfluent.io.solid import load_solid, save_solid
 from gsfluent.pipeline.capture.hull import masked_views
 from gsfluent.pipeline.render.cuts import save_cut_views
-from gsfluent.plan.cost import BYTES, CostModel, machine_key
+from gsfluent.plan.cost import CostModel, machine_key
 from gsfluent.plan.fact import actual_work
 from gsfluent.plan.fit import Sample, fit
 from gsfluent.plan.proxy import look_at_photographs
@@ -98,12 +98,9 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         draw_capture(folder / "photographs")
         report(1, "photographs")
         samples: list[Sample] = []
-        sizes: list[Sample] = []
         for number, size in enumerate(SIZES):
             values, planned = run_small(folder, size, device)
             samples += stage_samples(values, planned, cold=number == 0)
-            if device.type == "cuda":
-                sizes += memory_samples(values, planned)
             if number == 0:
                 first = simulation_sample(values, planned)
             report(number + 2, f"{size.name} shot")
@@ -133,7 +130,6 @@ def calibrate(device: torch.device | str, progress: Progress | None = None) -> C
         made=datetime.now(UTC).isoformat(timespec="seconds"),
         probe_seconds=time.perf_counter() - began,
         errors=errors,
-        memory=memory_costs(sizes),
     )
     _log.info(
         "measured what work costs on this device in %.1f s: %s",
@@ -261,27 +257,6 @@ def stage_samples(
         for name in FEATURES
         if name in done
     ]
-
-
-def memory_samples(
-    values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]
-) -> list[Sample]:
-    """Bytes that each stage that was not found finished has allocated on the GPU."""
-    return [
-        Sample(name, dict(work[name]) | {"start": 1.0}, float(stage["peak_device_memory_bytes"]))
-        for stage in values["stages"]
-        if (name := stage["name"]) in work
-        and not stage["resumed"]
-        and stage["peak_device_memory_bytes"] > 0
-    ]
-
-
-def memory_costs(samples: Sequence[Sample]) -> dict[str, dict[str, float]]:
-    """Bytes per unit of work of each stage, fitted to what the small shots have allocated."""
-    return {
-        stage: fit([s for s in samples if s.stage == stage], list(BYTES["cuda"][stage]))[0]
-        for stage in {sample.stage for sample in samples}
-    }
 
 
 def simulation_sample(values: Mapping[str, Any], work: Mapping[str, Mapping[str, float]]) -> Sample:

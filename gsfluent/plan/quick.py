@@ -58,7 +58,6 @@ def quick_model(device: torch.device | str) -> CostModel | None:
         }
         for stage, costs in known["seconds"].items()
     }
-    model.memory = known.get("memory", {})  # hangs on the work, not on the machine
     model.probe_seconds = time.perf_counter() - start
     return model
 

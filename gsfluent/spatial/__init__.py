@@ -13,7 +13,7 @@ __getattr__, __dir__, __all__ = room(
     pieces="hilbert_code sample signed_depth small_pieces",
     shape="cluster lone_points robust_box thin_parts",
     standing="upright",
-    voxels="distance_transform grown nearest_empty surface",
+    voxels="distance_transform grown nearest_empty small_convolutions surface",
     winding="winding_numbers",
     zbuffer="nearest_points",
 )

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent.spatial.voxels import small_convolutions
+
 _PER_SPACING = 1.7  # pieces per spacing and axis, at least
 _FINEST = 8  # pieces per voxel and axis, at most
 
@@ -63,7 +65,8 @@ def signed_depth(inside: Tensor, depth: Tensor) -> Tensor:
         pad = [0] * 6
         pad[4 - 2 * axis] = pad[5 - 2 * axis] = 1
         kernel = field.new_tensor([0.25, 0.5, 0.25]).view(1, 1, *size)
-        field = functional.conv3d(functional.pad(field, pad, mode="replicate"), kernel)
+        with small_convolutions():
+            field = functional.conv3d(functional.pad(field, pad, mode="replicate"), kernel)
     # sheets one voxel thick stay inside
     return torch.where(inside, field[0, 0].clamp_min(0.05), field[0, 0])
 

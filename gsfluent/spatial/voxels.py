@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -65,3 +67,11 @@ def surface(occupied: np.ndarray) -> np.ndarray:
 
     result: np.ndarray = occupied & ~ndimage.binary_erosion(occupied)
     return result
+
+
+def small_convolutions() -> AbstractContextManager[None]:
+    """Where convolutions do without cuDNN: to load it costs half a second of a process.
+
+    Theirs are few and small. They are also exact in float32, which cuDNN rounds to TF32.
+    """
+    return torch.backends.cudnn.flags(enabled=False)

@@ -128,3 +128,19 @@ def test_one_run_is_believed_by_two_thirds() -> None:
     assert made.correction("render") == pytest.approx(8.0 ** (2 / 3))
     made.learn("render", Cost(1.0, 1), Cost(0.0, 1))  # a stage that was found finished
     assert len(made.ratios["render"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("points", "born", "took"),
+    [
+        (22_094, 57_450, 513),  # demo
+        (435_131, 178_300, 2378),  # bread_torn
+        (733_556, 1_155_000, 4809),  # watermelon_dropped
+        (1_480_545, 2_408_000, 8538),  # melons_collided
+        (1_804_161, 0, 5519),  # milk_poured
+    ],
+)
+def test_memory_of_simulations_that_an_h200_ran(points: int, born: int, took: int) -> None:
+    features = {"start": 1.0, "points": float(points), "born": float(born)}
+    said = plan_cost.memory_of("simulate", features, "cuda") / 2**20
+    assert said == pytest.approx(took, rel=0.25)

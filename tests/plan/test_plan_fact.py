@@ -172,7 +172,6 @@ def test_costs_of_the_reference_go_at_the_pace_of_this_machine(
     monkeypatch.setattr("torch.cuda.get_device_name", lambda device: "another GPU")
     made = quick.quick_model(device)
     assert made is not None and not made.measured
-    assert made.memory == known.get("memory", {})
     for stage, piece in quick.STAGE_PIECES.items():
         for feature, cost in known["seconds"][stage].items():
             wanted = cost * pace["arrays" if feature == "start" else piece]

@@ -77,24 +77,3 @@ def test_an_export_whose_extra_is_missing_is_not_measured(
     costs = plan_probe.export_costs(found)[0]
     # as dear as the others are
     assert costs["usd_gaussians"] == pytest.approx(costs["spz_gaussians"]) == pytest.approx(0.1)
-
-
-def test_memory_of_a_gpu_is_fitted_to_what_was_allocated() -> None:
-    truth = {"start": 3e7, "gaussians": 900.0, "pixels": 250.0}
-    sizes = [(2e3, 3e3), (9e3, 12e3), (3e4, 5e4), (3e4, 1.1e5)]
-    values, samples = {}, []
-    for splats, pixels in sizes:
-        work = {"render": {"gaussians": splats, "pixels": pixels, "start": 0.0}}
-        held = truth["start"] + 900.0 * splats + 250.0 * pixels
-        stages = [("render", held), ("regions", 1.0)]
-        values = {
-            "stages": [
-                {"name": name, "resumed": False, "peak_device_memory_bytes": size}
-                for name, size in stages
-            ]
-        }
-        samples += plan_probe.memory_samples(values, work)
-    values["stages"][0]["resumed"] = True
-    assert len(samples) == 4 and plan_probe.memory_samples(values, {"render": {}}) == []
-    assert plan_probe.memory_costs(samples)["render"] == pytest.approx(truth, rel=0.1)
-    assert plan_probe.memory_costs([]) == {}

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.data import BACKGROUND, Camera, Gaussians
-from gsfluent.draw import draw
+from gsfluent.data import BACKGROUND, Camera, Gaussians, projected
+from gsfluent.draw import draw, draw_at
 from gsfluent.errors import InputError
 from gsfluent.metrics import psnr
 from gsfluent.pipeline.capture.hull import Hull
@@ -262,11 +262,17 @@ def _witness(
     seen = _Witness(zero, zero.clone(), zero.clone(), zero.clone(), zero.clone())
     slack = limits.depth * extent + 2.0 * longest
     means = gaussians.means.nan_to_num(nan=1e9)
-    for camera in map(_small, cameras):
-        result = draw(gaussians, camera, contribution=True, median_depth=True)
+    points, looks = means.double(), [_small(camera) for camera in cameras]
+    # where the splats are, all at once: a copy to a GPU takes as long as a picture
+    views, lenses = (
+        torch.stack([getattr(camera, name) for camera in looks]).to(points)
+        for name in ("viewmat", "K")
+    )
+    for camera, view, lens in zip(looks, views, lenses, strict=True):
+        size = (camera.width, camera.height)
+        result = draw_at(gaussians, view, lens, size, contribution=True, median_depth=True)
         assert result.contribution is not None and result.median_depth is not None
-        pixel, z = camera.project(means.double().cpu())
-        pixel, z = pixel.to(means), z.to(means)
+        pixel, z = (found.to(means) for found in projected(points, view, lens))
         column, row = pixel.floor().clamp(-1, 1e6).long().unbind(1)
         on = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -93,24 +92,54 @@ def cut_view(
     Raises:
         ValueError: Unknown axis, a size below 16 or a tilt out of range.
     """
+    body = solid if isinstance(solid, CutBody) else CutBody(solid)
+    view = _view(body, axis, up, offset, size, tilt)
+    return _pictures(body, [view], size, background, splats)[0]
+
+
+def _view(
+    body: CutBody,
+    axis: int | str | Sequence[float] | np.ndarray,
+    up: Sequence[float] | np.ndarray | None,
+    offset: float | None,
+    size: int,
+    tilt: float,
+) -> _Trace | None:
+    """What :func:`cut_view` is asked for; None of a solid that is empty."""
     normal, right, top = _directions(axis, up)
     if size < 16:
         raise ValueError(f"cut_view: size must be at least 16 pixels, got {size}")
     if not abs(tilt) < 80.0:
         raise ValueError(f"cut_view: tilt must be below 80 degrees, got {tilt}")
-    body = solid if isinstance(solid, CutBody) else CutBody(solid)
     if not len(body.centers):
-        return np.full((size, size, 3), background, np.float32)
+        return None
     place = body.centers @ normal
     voxel = body.solid.voxel
     half = 0.5 * voxel * np.abs(normal).sum()
     low, high = float(place.min()) - half, float(place.max()) + half
     plane = 0.5 * (low + high) if offset is None else min(max(offset, low), high)
     eye = _eye(body.centers[place >= plane - half], normal, right, top, tilt, size, voxel)
-    view = _Trace(body, normal, plane, eye)
-    image, covered = view.shaded(splats)
-    image = image * covered[..., None] + background * (1.0 - covered[..., None])
-    return (image.reshape(eye.height, eye.width, 3).numpy().clip(0.0, 1.0)).astype(np.float32)
+    return _Trace(body, normal, plane, eye)
+
+
+def _pictures(
+    body: CutBody, views: Sequence[_Trace | None], size: int, background: float, splats: bool
+) -> list[np.ndarray]:
+    """The pictures of some views; their rays run side by side."""
+    traces = [view for view in views if view is not None]
+    if not traces:
+        return [np.full((size, size, 3), background, np.float32) for _ in views]
+    first = [view.value(view.start) for view in traces]
+    forward = [view.forward.expand_as(view.start) for view in traces]
+    rays = torch.cat([view.start for view in traces]), torch.cat(forward), torch.cat(first)
+    hit, nearest = (found.split([len(f) for f in first]) for found in _march(body, *rays))
+    made = []
+    for view, *met in zip(traces, first, hit, nearest, strict=True):
+        image, covered = view.shaded(splats, *met)
+        image = image * covered[..., None] + background * (1.0 - covered[..., None])
+        image = image.reshape(view.eye.height, view.eye.width, 3)
+        made.append(image.numpy().clip(0.0, 1.0).astype(np.float32))
+    return made
 
 
 def _directions(
@@ -215,14 +244,21 @@ class _Trace:
         """Signed distance [voxels] at world points [N, 3]."""
         return _at(self.field, (points - self.origin) / self.solid.voxel)
 
-    def shaded(self, splats: bool) -> tuple[Tensor, Tensor]:
-        """Colours [N, 3] and coverage [N] of all pixels."""
-        first = self.value(self.start)
+    def shaded(
+        self, splats: bool, first: Tensor, hit: Tensor, nearest: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Colours [N, 3] and coverage [N] of all pixels.
+
+        Args:
+            splats: As for :func:`cut_view`.
+            first: Signed distance [voxels] where each ray begins, [N].
+            hit: See :func:`_march`.
+            nearest: See there.
+        """
         # by its slope in the picture: a plane that grazes the surface has no half covered pixels
         rows, columns = np.gradient(first.view(self.eye.height, self.eye.width).numpy())
         slope = torch.from_numpy(np.hypot(rows, columns)).reshape(-1).clamp_min(1e-3 * self.pixel)
         face = (0.5 - first / slope).clamp(0.0, 1.0)
-        hit, nearest = self._march(first)
         skin = (0.5 - nearest / self.pixel).clamp(0.0, 1.0)
         skin = torch.where(hit >= 0, torch.ones_like(skin), skin)
         covered = torch.maximum(face, skin)
@@ -241,33 +277,6 @@ class _Trace:
             only = (hit[rows] < 0) & (face[rows] > 0)
             image[rows[only]] = self._face_colors(self.start[rows[only]])
         return image, covered
-
-    def _march(self, first: Tensor) -> tuple[Tensor, Tensor]:
-        """How far each ray runs to the skin [world units], -1 for a miss; least distance met."""
-        voxel, device = self.solid.voxel, self.solid.occupancy.device
-        field, origin, start, forward, first = (
-            x.to(device) for x in (self.field, self.origin, self.start, self.forward, first)
-        )
-        hit = torch.full_like(first, -1.0, dtype=torch.float64)
-        nearest = first.clamp_min(0.0).clone()
-        # those on the face have arrived
-        live = (first > _HIT).nonzero()[:, 0]
-        hit[first <= _HIT] = 0.0
-        gone = torch.zeros(len(live), dtype=torch.float64, device=device)
-        reach = float(np.linalg.norm(field.shape)) * voxel
-        value = first[live]
-        for _ in range(_STEPS):
-            if not len(live):
-                break
-            # a trilinear, smoothed field overstates distances a little
-            gone = gone + (0.8 * value.clamp_min(0.1)).double() * voxel
-            value = _at(field, (start[live] + gone[:, None] * forward - origin) / voxel)
-            nearest[live] = torch.minimum(nearest[live], value)
-            arrived = value <= _HIT
-            hit[live[arrived]] = gone[arrived]
-            kept = ~arrived & (gone < reach)
-            live, gone, value = live[kept], gone[kept], value[kept]
-        return hit.cpu(), nearest.cpu()
 
     def _face_colors(self, points: Tensor) -> Tensor:
         """Colours of the matter at points [N, 3] of the plane."""
@@ -336,6 +345,42 @@ class _Trace:
         return image.reshape(-1, 3), alpha.reshape(-1)
 
 
+def _march(body: CutBody, start: Tensor, forward: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+    """How far rays run to the skin [world units], -1 for a miss; least distance met [voxels].
+
+    Args:
+        body: What they meet.
+        start: Where they begin, float64 [N, 3].
+        forward: Unit vectors, float64 [N, 3].
+        first: Signed distance [voxels] where they begin, [N].
+    """
+    voxel, device = body.solid.voxel, body.solid.occupancy.device
+    field, origin, first = (
+        x.to(device) for x in (body.field, body.solid.origin.cpu().double(), first)
+    )
+    hit = torch.full_like(first, -1.0, dtype=torch.float64)
+    nearest = first.clamp_min(0.0).clone()
+    # those on the face have arrived
+    live = (first > _HIT).nonzero()[:, 0]
+    hit[first <= _HIT] = 0.0
+    start, forward = start.to(device)[live], forward.to(device)[live]
+    gone = torch.zeros(len(live), dtype=torch.float64, device=device)
+    reach = float(np.linalg.norm(field.shape)) * voxel
+    value = first[live]
+    for _ in range(_STEPS):
+        if not len(live):
+            break
+        # a trilinear, smoothed field overstates distances a little
+        gone = gone + (0.8 * value.clamp_min(0.1)).double() * voxel
+        value = _at(field, (start + gone[:, None] * forward - origin) / voxel)
+        nearest[live] = torch.minimum(nearest[live], value)
+        arrived = value <= _HIT
+        hit[live] = torch.where(arrived, gone, -1.0)
+        kept = (~arrived & (gone < reach)).nonzero()[:, 0]
+        live, start, forward, gone, value = (x[kept] for x in (live, start, forward, gone, value))
+    return hit.cpu(), nearest.cpu()
+
+
 def _smooth_field(occupied: np.ndarray) -> Tensor:
     """Signed distance [voxels], negative inside, without the stairs and hairs of voxels."""
     outer = np.maximum(distance_transform(~occupied) - 0.5, 0.0)
@@ -367,13 +412,18 @@ def _spread(solid: Solid) -> Tensor:
 
 def _at(field: Tensor, place: Tensor) -> Tensor:
     """Trilinear values [N] at positions [N, 3] in voxels; distance is added off the grid."""
-    size = torch.tensor(field.shape, dtype=place.dtype, device=place.device)
+    size = _size(field.shape, place.dtype, place.device)
     held = torch.minimum(place.clamp_min(0.5), size - 0.5)
     where = (2.0 * held / size - 1.0).flip(-1).to(field)[None, None, None]
     value = functional.grid_sample(
         field[None, None], where, padding_mode="border", align_corners=False
     )
     return value[0, 0, 0, 0] + (place - held).norm(dim=1).to(field)
+
+
+@functools.lru_cache(maxsize=8)
+def _size(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(shape, dtype=dtype, device=device)
 
 
 _HEIGHT, _GAP, _GROUND = 360, 12, 0.96  # of the sheet: pixels, pixels, grey
@@ -392,13 +442,9 @@ def save_cut_views(solid: Solid, path: Path) -> None:
     turn = np.eye(3) if solid.frame is None else solid.frame.rotation.numpy()
     x, y, z = turn  # scene axes in the solid's own frame
     aslant = 0.8 * x + 0.6 * y
-    asked: list[dict[str, Any]] = [
-        {"axis": x, "up": z},
-        {"axis": y, "up": z},
-        {"axis": -z, "up": y},
-        {"axis": aslant, "up": z, "tilt": _TILT},
-    ]
-    views = [cut_view(body, **each, size=_HEIGHT, background=_GROUND) for each in asked]
+    asked = [(x, z, 0.0), (y, z, 0.0), (-z, y, 0.0), (aslant, z, _TILT)]
+    looks = [_view(body, axis, up, None, _HEIGHT, tilt) for axis, up, tilt in asked]
+    views = _pictures(body, looks, _HEIGHT, _GROUND, splats=True)
     height = max(view.shape[0] for view in views) + 2 * _GAP
     width = sum(view.shape[1] for view in views) + _GAP * (len(views) + 1)
     sheet = np.full((height, width, 3), _GROUND, np.float32)

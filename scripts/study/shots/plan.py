@@ -73,7 +73,7 @@ def run(name: str, options: argparse.Namespace) -> dict[str, Any]:
         raise SystemExit(f"{name}: the run failed: {done.stderr[-2000:]}")
     values = json.loads((out / "run.json").read_text(encoding="utf-8"))
     section = values["plan"]
-    kept = ("seconds", "memory", "probe_seconds", "machine")
+    kept = ("seconds", "probe_seconds", "machine")
     simulation = values["simulation"]
     return {
         "scene": name,
@@ -109,7 +109,7 @@ def shot_text(name: str, quality: str | None) -> str:
 def taught(line: dict[str, Any], others: list[dict[str, Any]]) -> dict[str, Cost]:
     """What a model says to a shot that has learned from other shots, by stage."""
     probe = line["probe"]
-    model = CostModel(probe["machine"], probe["seconds"], memory=probe.get("memory", {}))
+    model = CostModel(probe["machine"], probe["seconds"])
     for other in others:
         for name, fact in other["actual"].items():
             said = model.stage(name, other["work_actual"][name], corrected=False)

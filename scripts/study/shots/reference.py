@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     write_json(options.output or REFERENCE[options.device], {
         "processor": where, "threads": model.machine["threads"], "made": model.made,
         "pieces": found, "seconds": model.seconds, "errors": model.errors,
-    } | ({"memory": model.memory} if model.memory else {}))  # fmt: skip
+    })  # fmt: skip
     return 0
 
 

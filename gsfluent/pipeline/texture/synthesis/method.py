@@ -27,6 +27,7 @@ from gsfluent.pipeline.texture.synthesis.patches import Schedule
 from gsfluent.pipeline.texture.synthesis.pyramid import synthesize_pyramid, to_grid
 from gsfluent.pipeline.texture.volume.domain import InteriorDomain, InteriorTexture
 from gsfluent.progress import Progress
+from gsfluent.spatial.voxels import small_convolutions
 
 logger = logging.getLogger(__name__)
 
@@ -159,18 +160,19 @@ def exemplar_texture(
     if surface == "copy":
         rgb, figures = crop.skin, {"levels": 0, "axis_disagreement": 0.0}
     else:
-        volume, lattice, figures = synthesize_pyramid(
-            fields,
-            prepared,
-            QUALITIES[options.quality],
-            kind,
-            own=guide if isinstance(guide, np.ndarray) else None,
-            directional=options.directional,
-            keep=surface == "keep",
-            closed=options.core == "closed",
-            seed=seed,
-            progress=progress,
-        )
+        with small_convolutions():
+            volume, lattice, figures = synthesize_pyramid(
+                fields,
+                prepared,
+                QUALITIES[options.quality],
+                kind,
+                own=guide if isinstance(guide, np.ndarray) else None,
+                directional=options.directional,
+                keep=surface == "keep",
+                closed=options.core == "closed",
+                seed=seed,
+                progress=progress,
+            )
         rgb = to_grid(volume, lattice, fields)
     labels = np.zeros(crop.inside.shape, np.int32)
     count = 0
