@@ -42,8 +42,8 @@ CHANCE = 3.0
 TELLING, QUIET = 30, 0.05
 """Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
 PATTERNS = (3, 3, 6)
-"""Numbers of a shift, a turn and an even strain. What a grid gets wrong it gets wrong for all points
-of a body alike, so each of these has a noise of its own, beside that of the rest."""
+"""Numbers of a shift, a turn and an even strain. What a grid gets wrong it gets wrong for all
+points of a body alike, so each of these has a noise of its own, beside that of the rest."""
 CORRECTIONS = 4
 """How often at most the change by a finer grid is seen anew, on all frames."""
 NEAR = (0.8, 1.02)
