@@ -81,6 +81,20 @@ class _Tracked:
             parts.append(gap[torch.isfinite(gap)])
         return joined(parts, numbers) if parts else (torch.zeros(0), torch.zeros(0).long())
 
+    def patterns(self, motion: Motion, frame: int) -> Tensor:
+        """Shifts, turns and even strains of what is seen in a frame, one a column, [R, 12]."""
+        seen = torch.isfinite(self.target.positions[frame])[self.rows]
+        arm = self.followers.places(motion, frame)[0][self.rows]
+        arm = arm - arm.mean(dim=0)
+        made = [eye.expand_as(arm) for eye in torch.eye(3, dtype=arm.dtype)]
+        for sign in (-1.0, 1.0):
+            for i, j in ((0, 1), (0, 2), (1, 2)):
+                map = torch.zeros(3, 3, dtype=arm.dtype)
+                map[i, j], map[j, i] = 1.0, sign
+                made.append(arm @ map.T)
+        made += [arm @ torch.diag(eye) for eye in torch.eye(3, dtype=arm.dtype)]
+        return torch.stack([column[seen] for column in made], dim=1)
+
 
 class Clouds:
     """Clouds of surface points, or splat centres, without names (GIC: Cai et al. 2024).

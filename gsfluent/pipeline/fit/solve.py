@@ -41,6 +41,9 @@ CHANCE = 3.0
 """Deviations that a correlation of noise stays below."""
 TELLING, QUIET = 30, 0.05
 """Residuals that a frame needs to tell its own noise, and the least of it, in deviations."""
+PATTERNS = (3, 3, 6)
+"""Numbers of a shift, a turn and an even strain. What a grid gets wrong it gets wrong for all
+points of a body alike, so each of these has a noise of its own, beside that of the rest."""
 CORRECTIONS = 4
 """How often at most the change by a finer grid is seen anew, on all frames."""
 NEAR = (0.8, 1.02)
@@ -122,7 +125,9 @@ class Problem:
         self.forward, self.observer, self.unknowns = forward, observer, unknowns
         self.step, self.fixed = step, fixed or {}
         self.change: Motion | None = None
-        self.trust = np.ones(len(forward.times))
+        self.trust = np.ones((len(forward.times), 1 + len(PATTERNS)))
+        self.modes: dict[int, Array] = {}
+        self._moved = np.zeros((len(forward.times), len(PATTERNS)))
         self._last: tuple[Any, Motion] | None = None
         self._dt: float | None = None
 
@@ -184,33 +189,90 @@ class Problem:
             fine.strain,
         )
         pairs = self.observer.pair(coarse)
-        self.trust[:] = 1.0
-        gap, frame = self.seen(coarse, frames, pairs)
         with_it = coarse._replace(
             position=coarse.position + self.change.position,
             deformation=coarse.deformation + self.change.deformation, impulse=fine.impulse,
         )  # fmt: skip
-        shift = self.seen(with_it, frames, pairs)[0] - gap
-        for k in range(frames):
-            if (frame == k).any():
-                size = float(np.mean(shift[frame == k] ** 2))
-                self.trust[k] = (1.0 + UNSURE**2 * size) ** -0.5
+        gap, frame = self._gaps(coarse, frames, pairs)
+        shift = self._gaps(with_it, frames, pairs)[0] - gap
+        self._tell_patterns(with_it, frames, frame)
+        sizes = self._sizes(shift, frame, frames)
+        sizes[:, 1:] = np.maximum.accumulate(sizes[:, 1:], axis=0)
+        self._moved[:frames] = sizes[:, 1:]
+        self.trust[:frames] = (1.0 + (UNSURE * sizes) ** 2) ** -0.5
 
-    def reweigh(self, per_frame: Sequence[float], count: int) -> None:
+    def reweigh(self, free: Array, frames: int) -> None:
         """Take what a frame was missed by for its noise, where it has enough to tell.
 
         What the model gets wrong grows after contact; a free flight is foretold to a fraction of
         the noise that was believed, and what it shows of velocities need not suffer from the rest.
 
         Args:
-            per_frame: Root mean square residuals.
-            count: How many residuals there are.
+            free: Where the search has ended.
+            frames: How many frames count.
         """
-        if count < TELLING * len(per_frame):
+        motion = run_at(self, free, frames)[1]
+        gap, frame = self._gaps(motion, frames, self.observer.pair(motion))
+        if len(gap) < TELLING * frames:
             return
-        for k, size in enumerate(per_frame):
-            if size > 0.0:
-                self.trust[k] = 1.0 / max(size, QUIET)
+        if not self.modes:
+            self._tell_patterns(motion, frames, frame)
+        sizes = np.maximum(self._sizes(gap, frame, frames), QUIET)
+        # three numbers of a frame may be small by chance, and a velocity that follows them would
+        # keep them so: patterns are missed by one part of what the finer grid changes of them
+        moved = self._moved[:frames]
+        told = moved > 1.0
+        part = np.where(told, sizes[:, 1:] / np.maximum(moved, 1.0), 0.0)
+        part = np.sqrt((part**2).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
+        sizes[:, 1:] = np.maximum(sizes[:, :1], np.minimum(part, 1.0) * moved)
+        self.trust[:frames] = 1.0 / sizes
+
+    def _tell_patterns(self, motion: Motion, frames: int, frame: NDArray[np.int64]) -> None:
+        """Orthonormal patterns of a shift, a turn and a strain in the residuals of each frame."""
+        self.modes = {}
+        patterns = getattr(self.observer, "patterns", None)
+        if patterns is None:
+            return
+        for k in range(frames):
+            if int((frame == k).sum()) >= TELLING:
+                made = patterns(motion, k).double().numpy()
+                found, size = np.linalg.qr(made)
+                if np.abs(np.diag(size)).min() > 1e-6 * np.abs(size).max():
+                    self.modes[k] = found
+
+    def _sizes(self, gap: Array, frame: NDArray[np.int64], frames: int) -> Array:
+        """Root mean squares of the rest and of the patterns in residuals, [frames, 1 + G]."""
+        found = np.zeros((frames, 1 + len(PATTERNS)))
+        for k in set(frame.tolist()):
+            here = gap[frame == k]
+            if k not in self.modes:
+                found[k] = np.sqrt(np.mean(here**2))
+                continue
+            part = self.modes[k].T @ here
+            rest = here - self.modes[k] @ part
+            each = np.split(part, np.cumsum(PATTERNS)[:-1])
+            found[k, 0] = np.sqrt(float(rest @ rest) / (len(rest) - len(part)))
+            found[k, 1:] = [np.sqrt(np.mean(one**2)) for one in each]
+        return found
+
+    def weighed(self, gap: Array, frame: NDArray[np.int64], power: float = 1.0) -> Array:
+        """Residuals in deviations of frames and patterns, or back with the power -1."""
+        trust = self.trust**power
+        found = gap * trust[frame, 0]
+        for k, modes in self.modes.items():
+            here = frame == k
+            if int(here.sum()) != len(modes):
+                continue  # more frames were seen than count here
+            part = (np.repeat(trust[k, 1:], PATTERNS) - trust[k, 0]) * (modes.T @ gap[here])
+            found[here] += modes @ part
+        return found
+
+    def doubt(self, frame: NDArray[np.int64]) -> float:
+        """Sum of the logarithms of the deviations of these residuals."""
+        found = -float(np.log(self.trust[frame, 0]).sum())
+        for k in set(self.modes) & set(frame.tolist()):
+            found -= float((PATTERNS * np.log(self.trust[k, 1:] / self.trust[k, 0])).sum())
+        return found
 
     def dt(self, free: Array) -> float:
         """A time step for a linearisation about them: the last one as long as it is near.
@@ -224,8 +286,13 @@ class Problem:
 
     def seen(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
         """Residuals and their frames."""
+        gap, frame = self._gaps(motion, frames, pairs)
+        return self.weighed(gap, frame), frame
+
+    def _gaps(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
+        """Residuals in standard deviations of the target, and their frames."""
         gap, frame = self.observer.residuals(motion, frames, pairs)
-        return gap.double().numpy() * self.trust[frame.numpy()], frame.numpy()
+        return gap.double().numpy(), frame.numpy()
 
 
 def weights(residual: Array) -> Array:
@@ -310,11 +377,11 @@ def search(
         size = len(unknowns)
         return Fitted(free, 0.0, 0.0, np.zeros((size, size)), np.diag(unknowns.spread**2), [],
                       problem.forward.runs - runs, float(at.motion.strain))  # fmt: skip
-    own = scale / problem.trust[at.frame]
-    raw = residual * own
+    raw = problem.weighed(scale * residual, at.frame, -1.0)
+    doubt = len(raw) * math.log(scale) + problem.doubt(at.frame)
     return Fitted(
         free=free,
-        cost=here + float(np.log(own).sum()),
+        cost=here + doubt,
         rms=float(np.sqrt(np.mean(raw**2))),
         information=_spread(normal, rows, len(unknowns)),
         covariance=_covariance(jacobian, weight * residual, weight, at.frame, prior, rows),
@@ -507,7 +574,7 @@ def in_stages(
             if finer is not None:
                 problem.refine(finer, free, count)
             if weigh and number and found is not None:
-                problem.reweigh(found.per_frame, found.count)
+                problem.reweigh(free, count)
             found = search(problem, free, count, rounds=12 if last else 5,
                            enough=0.0 if last and weigh else ENOUGH, tell=tell)  # fmt: skip
             moved, free = float(np.abs(found.free - free).max()), found.free

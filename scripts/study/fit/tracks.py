@@ -1,7 +1,7 @@
 """Materials learnt from tracks: error and bands on random scenes, truth by the whole simulation.
 
 python scripts/study/fit/tracks.py --scenes 10 --jobs 16 --minutes 8  # a process a core; goes on
-python scripts/study/fit/tracks.py --scenes 10 --jobs 5 --beside 10 --device cuda  # ten as one run
+python scripts/study/fit/tracks.py --device cuda --jobs 6 --truths DIR  # truths are kept for later
 
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
@@ -41,7 +41,7 @@ from gsfluent.targets import Points
 
 DATA = Path(__file__).resolve().parents[3] / "docs" / "measured" / "data"
 PAGE = DATA.parent / "fit.md"
-FPS, FRAMES, TRACKS, SIDE, GAP = 24.0, 14, 150, 0.3, 0.25
+FPS, FRAMES, TRACKS, SIDE, GAP = 24.0, 12, 150, 0.3, 0.25
 VOXELS = 48
 
 
@@ -141,14 +141,19 @@ def scene_of(kind: Kind, solid: Solid, values: dict[str, float], velocity: Any) 
     return scene
 
 
+def thing(kind: Kind, random: np.random.Generator) -> tuple[Solid, np.ndarray, dict[str, float]]:
+    """A thing, its velocity and numbers."""
+    solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
+    velocity = np.array([*random.uniform(-0.3, 0.3, 2), random.uniform(-1.5, -0.5)])
+    drawn = {name: random.uniform(*ends) for name, ends in kind.truth.items()}
+    return solid, velocity, {k: v if k in PLAIN else 10**v for k, v in drawn.items()}
+
+
 def fall(
     kind: Kind, number: int, cells: int, random: np.random.Generator, device: str = "cpu"
 ) -> tuple[Solid, np.ndarray, dict[str, float], list[Particles]]:
     """A thing, its velocity and numbers, its points at the frames of its fall."""
-    solid = ellipsoid(0.5 * SIDE * random.uniform(0.7, 1.0, 3))
-    velocity = np.array([*random.uniform(-0.3, 0.3, 2), random.uniform(-1.5, -0.5)])
-    drawn = {name: random.uniform(*ends) for name, ends in kind.truth.items()}
-    true = {name: v if name in PLAIN else 10**v for name, v in drawn.items()}
+    solid, velocity, true = thing(kind, random)
     dx = SIDE / (cells * RATIO * 2.0)
     run = Simulate(dx=dx, seed=100 + number, repair=False, device=device)(
         scene_of(kind, solid, true, velocity), fps=FPS, seconds=FRAMES / FPS
@@ -206,11 +211,11 @@ def errors_of(found: Found, true: dict[str, float], velocity: np.ndarray) -> lis
 
 def record(
     kind: str, number: int, cells: int, kept: Path | None = None, device: str = "cpu",
-    truth: str = "cpu",
+    truth: str = "cpu", truths: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One scene: truth, fit, errors."""
     torch.set_num_threads(1)
-    return fitted(shown(kind, number, cells, truth), kept, device)
+    return fitted(shown(kind, number, cells, truth, truths), kept, device)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,15 +233,26 @@ class Shown:
     seconds: float
 
 
-def shown(kind: str, number: int, cells: int, device: str) -> Shown:
-    """Simulate the truth of a scene."""
+def shown(kind: str, number: int, cells: int, device: str, truths: Path | None = None) -> Shown:
+    """Simulate the truth of a scene, or read what was seen of it another time."""
     here = KINDS[kind]
     random = np.random.default_rng([number, len(kind)])
     begun = clock.perf_counter()
-    solid, velocity, true, tracks, points = seen(here, number, cells, random, device)
-    guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))
-    seconds = clock.perf_counter() - begun
-    return Shown(kind, number, cells, true, velocity, guess, tracks, points, seconds)
+    path = None if truths is None else truths / f"{kind}_{number}_{cells}.npz"
+    if path is not None and path.is_file():
+        with np.load(path) as file:
+            known = {name: file[name] for name in file.files}
+        solid, velocity, true = thing(here, random)
+        guess = known["guess"]
+        tracks, points, seconds = known["tracks"], int(known["points"]), float(known["seconds"])
+    else:
+        solid, velocity, true, tracks, points = seen(here, number, cells, random, device)
+        guess = velocity + random.uniform(-0.2, 0.2, 3)
+        seconds = clock.perf_counter() - begun
+        if path is not None:
+            np.savez_compressed(path, tracks=tracks, points=points, seconds=seconds, guess=guess)
+    start = scene_of(here, solid, here.start, guess)
+    return Shown(kind, number, cells, true, velocity, start, tracks, points, seconds)
 
 
 def fitted(made: Shown, kept: Path | None, device: str) -> dict[str, Any]:
@@ -287,12 +303,12 @@ def noted(
 
 def beside(
     kind: str, numbers: list[int], cells: int, kept: Path | None, device: str, truth: str,
-    path: Path,
+    truths: Path | None, path: Path,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Scenes of one matter, whose fits wait for each other."""
     torch.set_num_threads(1)
     begun = clock.perf_counter()
-    made = [shown(kind, number, cells, truth) for number in numbers]
+    made = [shown(kind, number, cells, truth, truths) for number in numbers]
     middle = clock.perf_counter()
     rows = noted(lambda one: fitted(one, kept, device), made, path)
     print(f"{kind}: {len(rows)} scenes, truth {middle - begun:.1f} s, fits "
@@ -406,20 +422,22 @@ def main() -> None:
         "--minutes", type=float, default=1e6, help="what is not done by then is left"
     )
     parser.add_argument("--out", type=Path, default=DATA / "fit_tracks.jsonl")
+    parser.add_argument("--truths", type=Path, help="folder of what was seen, for another time")
     parser.add_argument("--keep", type=Path, help="folder for residuals and Jacobians of scenes")
     parser.add_argument("--markdown", type=Path, default=PAGE)
     options = parser.parse_args()
     path: Path = options.out
-    if options.keep is not None:
-        options.keep.mkdir(parents=True, exist_ok=True)
+    for folder in (options.keep, options.truths):
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
     records = read(path)
     done = {(r["kind"], r["scene"]) for r in records}
     kept, device, cells = options.keep, options.device, options.cells
-    truth, size = options.truth or device, options.beside
+    truth, size, truths = options.truth or device, options.beside, options.truths
     slow_first = [k for k in reversed(KINDS) if k in options.only]
     if size > 1:
         groups = [
-            (k, left, cells, kept, device, truth, path)
+            (k, left, cells, kept, device, truth, truths, path)
             for i in range(0, options.scenes, size)
             for k in slow_first
             if (left := [n for n in range(i, min(i + size, options.scenes)) if (k, n) not in done])
@@ -427,7 +445,7 @@ def main() -> None:
         in_pool(beside, groups, path, options.jobs, options.minutes)
     else:
         wanted = [(k, n) for n in range(options.scenes) for k in slow_first if (k, n) not in done]
-        tasks = [(k, n, cells, kept, device, truth) for k, n in wanted]
+        tasks = [(k, n, cells, kept, device, truth, truths) for k, n in wanted]
         in_pool(record, tasks, path, options.jobs, options.minutes)
     records = read(path)
     if records:

@@ -209,7 +209,7 @@ def test_a_finer_grid_sets_right_what_a_coarse_one_does_wrong() -> None:
     )
     error = [abs(math.log10(f.values[NAMES[0]]) - 5.0) for f in (one, two)]
     assert error[1] < 0.25 * error[0]
-    assert two.report["rms"] < 0.5 * one.report["rms"]
+    assert two.report["rms"] < 0.6 * one.report["rms"]
     assert 1.0 < two.values["grid.extrapolation"] < 2.0
     moved = two.report["parameters"][NAMES[0]]["grid"][0]
     assert two.sd[NAMES[0]] >= 0.5 * LEFT * abs(moved) > 0.0
