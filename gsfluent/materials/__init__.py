@@ -33,7 +33,7 @@ from gsfluent.materials.laws import (
     WORDS,
 )
 from gsfluent.materials.material import LOOKS, SCATTER, UNBROKEN, WHOLE, Field, Material, nearest
-from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
+from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse, opening
 
 __all__ = [
     "BREAKS",
@@ -56,6 +56,7 @@ __all__ = [
     "fruit",
     "get",
     "names",
+    "opening",
     "phase_field",
     "wet",
 ]

@@ -69,6 +69,7 @@ POSITIVE = (
 WORDS: dict[str, tuple[str, ...]] = {
     "law": tuple(LAWS),
     "prefer": ("toughness", "strength"),
+    "surface": ("cam_clay", "rankine"),
     "hysteresis": ("pressed", "both", "unloading"),
     "split": ("volumetric", "none", "spectral", "rankine"),
     "model": ("at1", "at2"),
@@ -204,7 +205,7 @@ def row(law: str, at: Callable[[str], Tensor]) -> Tensor:
         slope = 6.0 * sine / (3.0 - sine)  # q = M p
     if law == "nacc":
         strength, cohesion = slope, at("cohesion")
-        hardening, damage = at("hardening"), at("shear_damage")
+        hardening, damage = at("hardening"), at("shear_damage")  # -c of Rankine's surface
         exponent = 1.0 - at("restitution") ** 2  # of the energy, csrc/core/material/loss.h
     elif law == "drucker_prager":
         # |dev tau| = sqrt(2/3) q = 3 alpha_DP p

@@ -27,7 +27,7 @@ from gsfluent.materials.laws import (
     READS,
     WORDS,
 )
-from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse
+from gsfluent.materials.strength import LARGEST, STEEPEST, ellipse, opening
 
 Field = float | Tensor
 """A parameter: one number, or a grid of numbers over the solid's voxels (shape [X, Y, Z])."""
@@ -55,6 +55,7 @@ SHEAR = 0.03
 and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
 is whole, with 0.5 it is crushed)."""
 _PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness", "hysteresis": "pressed"}
+_ELLIPSE = {"surface": "cam_clay"}
 """What only brittle matter reads, as it is in other matter."""
 _PLAIN_FIELD = {"split": "volumetric", "model": "at1"}
 """What only phase_field reads."""
@@ -131,6 +132,9 @@ class Material:
         prefer: nacc, phase_field: what a grid keeps that is too coarse for both. ``toughness``
             keeps the fracture energy and lowers the strength (Bazant and Oh 1983), ``strength``
             keeps the strength, and a crack takes more energy than it should.
+        surface: nacc: ``cam_clay`` is the ellipse of the papers, which counts volume that has grown
+            as damage; ``rankine`` cuts off tension at its strength and counts what has opened, so
+            that a crack takes its energy whichever way it is pulled.
         split: phase_field: what drives a crack. ``volumetric``: shear and opening (Amor et al.);
             ``none``: all that is stored, for tension alone; ``spectral``: principal extensions
             (Miehe et al.), for matter in compression; ``rankine``: the largest tensile stress,
@@ -199,6 +203,7 @@ class Material:
     reference_volume: float = 1e-6
     prefer: str = "toughness"
     hysteresis: str = "pressed"
+    surface: str = "cam_clay"
     split: str = "volumetric"
     model: str = "at1"
     softening: float = 1.0
@@ -252,6 +257,14 @@ class Material:
                 hint="give both, or none: then nothing relaxes",
             )
         by_handbook = not missing
+        if self.surface == "rankine":
+            by_hand = [f for f in (*DERIVED, "shear_damage") if getattr(self, f) is not None]
+            if self.law != "nacc" or missing or by_hand:
+                raise InputError(
+                    f"material {self.name!r}: surface 'rankine' takes law 'nacc' with "
+                    f"{', '.join(HANDBOOK)}, and none of {', '.join(DERIVED)}, shear_damage",
+                    hint="take 'cam_clay' to give them by hand",
+                )
         for field, (low, high, unit) in RANGES.items():
             value = getattr(self, field)
             left = field in HANDBOOK or field in OPTIONAL.get(self.law, ())
@@ -259,6 +272,8 @@ class Material:
                 continue
             if value is None and field in defaults:
                 shear = by_handbook and field == "shear_damage"
+                if shear and self.surface == "rankine":
+                    continue
                 object.__setattr__(self, field, SHEAR if shear else defaults[field])
             elif value is None and field in reads:
                 raise InputError(
@@ -341,7 +356,7 @@ class Material:
             if law not in BREAKS:
                 changes = {**_PLAIN, **changes}
             if law != "nacc":  # what parts change are parameters of nacc
-                changes = {"parts": (), **changes}
+                changes = {"parts": (), **_ELLIPSE, **changes}
             if law == "phase_field" and self.fracture_energy is not None:
                 changes = {"toughness": self.fracture_energy, **changes}
             else:
@@ -350,6 +365,8 @@ class Material:
             law != self.law or changes.get("hysteresis", "unloading") != "unloading"
         ):
             changes = {"hysteresis": "pressed", "relaxation_time": None, **changes}
+        if changes.get("surface") == "rankine":
+            changes = {**dict.fromkeys((*DERIVED, "shear_damage")), **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)
@@ -494,9 +511,17 @@ class Material:
         if len(given) == len(DERIVED):
             return given
         none = torch.zeros((), dtype=torch.float64)
-        plain = laws.row("nacc", lambda f: none if f in DERIVED else self._at(f, at))
+        open_yet = (*DERIVED, "shear_damage") if self.surface == "rankine" else DERIVED
+        plain = laws.row("nacc", lambda f: none if f in open_yet else self._at(f, at))
         kappa = plain[..., 1]
         tensile, compressive = torch.broadcast_tensors(*self.strengths(at), kappa)[:2]
+        if self.surface == "rankine":
+            young = 9.0 * kappa * plain[..., 0] / (3.0 * kappa + plain[..., 0])
+            beta, hardening, alpha0, _ = opening(
+                kappa, young, tensile, torch.zeros_like(tensile), prefer="strength"
+            )
+            found = {"cohesion": beta, "hardening": hardening, "alpha0": alpha0}
+            return found | {"shear_damage": -compressive / tensile}
         beta, p0 = ellipse(plain[..., 2], tensile, compressive, LARGEST * kappa)
         beta = given.get("cohesion", beta)
         size = torch.asinh(p0 / kappa)

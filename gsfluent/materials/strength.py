@@ -1,10 +1,13 @@
-"""The yield ellipse of NACC through the strengths that handbooks give.
+"""The yield surfaces of brittle matter through the strengths that handbooks give.
 
-The surface is ``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0``. Uniaxial tension of a stress s
-is at ``p = -s/3, q = s``, uniaxial compression at ``p = s/3, q = s``.
+The ellipse of NACC is ``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0``. Uniaxial tension of a
+stress s is at ``p = -s/3, q = s``, uniaxial compression at ``p = s/3, q = s``. Rankine's surface
+takes both strengths as they are (csrc/core/material/rankine.h).
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -45,3 +48,38 @@ def ellipse(
     alone = (t**2 / m2 + t / 3.0 * reach) / (largest * reach - 2.0 * t**2 / m2)
     crowded = p0 > largest
     return torch.where(crowded, alone, beta), torch.where(crowded, largest, p0)
+
+
+SHAPE = 0.25
+"""``xi |alpha0|`` of Rankine's surface: so small that strength falls almost along a line."""
+
+
+def opening(
+    kappa: Tensor, young: Tensor, tensile: Tensor, energy: Tensor, *, prefer: str = "toughness"
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rankine's softening with a given energy per volume.
+
+    ``f = beta kappa sinh(xi |alpha|)`` takes ``beta kappa (cosh(xi |alpha0|) - 1) / xi`` until it is
+    gone, whatever the path. It must fall slower than matter unloads, else the energy is that of the
+    step: then there is less strength, or by ``prefer="strength"`` more energy.
+
+    Args:
+        kappa: Bulk modulus [Pa], [N].
+        young: Young's modulus [Pa], [N].
+        tensile: Tensile strength [Pa], [N].
+        energy: Energy per volume [J/m^3], [N].
+
+    Returns:
+        ``(beta, xi, alpha0, kept)``, [N] each; the last is the share of the strength that is left.
+    """
+    steepest = STEEPEST * torch.minimum(kappa, young)
+    cosh, sinh = math.cosh(SHAPE), math.sinh(SHAPE)
+    # -df/dalpha at the start is beta kappa xi cosh = (f / sinh)^2 (cosh - 1) cosh / energy
+    over = (cosh - 1.0) * cosh / sinh**2
+    limit = (steepest * energy / over).sqrt()
+    kept = (limit / tensile).clamp(max=1.0) if prefer == "toughness" else torch.ones_like(limit)
+    strength = tensile * kept
+    energy = energy.maximum(over * strength**2 / steepest)
+    beta = strength / (kappa * sinh)
+    xi = beta * kappa * (cosh - 1.0) / energy
+    return beta, xi, -SHAPE / xi, kept

@@ -32,7 +32,8 @@ struct MaterialRow {
                 // phase_field: threshold of psi+ [Pa]
   T cohesion;   // nacc: beta | drucker_prager: tensile pressure [Pa] | phase_field: damage d
   T hardening;  // nacc: xi | von_mises: hardening modulus [Pa] | phase_field: length [m]
-  T damage;     // nacc: eta, shear damage | phase_field: split and model (phase_field.h)
+  T damage;     // nacc: eta, shear damage; below zero: -c of Rankine's surface (rankine.h)
+                // phase_field: split and model (phase_field.h)
   T density;    // [kg/m^3]
   T exponent;   // fluid: gamma, 7 when 0 | nacc, phase_field: loss, by restitution (loss.h)
 };

@@ -143,10 +143,14 @@ GSF_HOST_DEVICE bool return_mapping_gradient(const Sym3<T>& strain, T alpha,
   if (law == kNacc) {
     if (!(alpha >= T(kAlphaMin) && alpha <= T(kAlphaMax))) return false;
     const NaccMaterial<T> nacc{m.mu, m.kappa, m.strength, m.cohesion, m.hardening, m.damage};
+    if (nacc.shear_damage < T(0)) {
+      if (!rankine_clearly_elastic(nacc, s, alpha)) return false;
+    }
     T u, w;
     normalized(nacc, yield_surface(nacc, alpha), T(-0.5) * m.kappa * s.j2m1,
                T(1.224744871391589) * m.mu * s.n, u, w);
-    plastic = u * u + w * w > T(1) + (sizeof(T) == 4 ? T(1e-6) : T(2e-15));
+    plastic = !(nacc.shear_damage < T(0)) &&
+              u * u + w * w > T(1) + (sizeof(T) == 4 ? T(1e-6) : T(2e-15));
   }
 
   const T pressed = T(0.5) * trace(g_stress);

@@ -4,8 +4,8 @@
 
 #include "core/material/args.h"
 #include "core/material/laws.h"
-#include "core/material/nacc.h"
 #include "core/material/phase_field.h"
+#include "core/material/rankine.h"
 #include "core/material/wave_speed.h"
 
 namespace gsf {
@@ -51,7 +51,7 @@ GSF_HOST_DEVICE ReturnMapped<T> return_mapping(const Sym3<T>& strain, T alpha,
     NaccState<T> r{s.d, s.j2m1, alpha, false};
     if (law == kNacc) {
       const NaccMaterial<T> nacc{m.mu, m.kappa, m.strength, m.cohesion, m.hardening, m.damage};
-      r = nacc_return(nacc, o, s, alpha);
+      r = brittle_return(nacc, o, s, alpha);
     }
     out.alpha = r.alpha;
     out.plastic = r.plastic;

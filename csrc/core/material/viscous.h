@@ -5,7 +5,7 @@
 // Definition: ops/viscous.py; equations: docs/theory/viscous.md.
 #pragma once
 
-#include "core/material/nacc.h"
+#include "core/material/rankine.h"
 
 namespace gsf {
 
@@ -65,7 +65,7 @@ template <typename T>
 GSF_HOST_DEVICE_COLD bool yield_spring(const NaccMaterial<T>& m, const NaccOptions<T>& o, T alpha,
                                        ElasticState<T>& spring) {
   const NaccOptions<T> still{o.k, o.epsilon, false};
-  const NaccState<T> found = nacc_return(m, still, spring, alpha);
+  const NaccState<T> found = brittle_return(m, still, spring, alpha);
   spring.d = found.d;
   spring.j2m1 = found.j2m1;
   return found.plastic;

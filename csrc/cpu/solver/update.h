@@ -4,6 +4,7 @@
 #pragma once
 
 #include "core/material/nacc_softened.h"
+#include "core/material/rankine.h"
 #include "cpu/solver/packet.h"
 
 namespace gsf::cpu {
@@ -36,8 +37,17 @@ typename Pack<T>::Int surely_elastic(const Pack<T>* row, Pack<T> cohesion, Pack<
   const P mu = row[0] / row[1], q2 = P(1.5) * mu * mu * n2;
   // u^2 + w^2 < 1 times (M A)^2. Written so that NaN means no; alpha out of its bounds is for the
   // full map to clamp, and so is a surface without height.
-  return (m2 * p * p + flat * q2 <= P(0.9999) * b2) & (alpha >= P(kAlphaMin)) &
-         (alpha <= P(kAlphaMax)) & (b2 > P(1e-16) * flat);
+  typename P::Int inside = (m2 * p * p + flat * q2 <= P(0.9999) * b2) & (b2 > P(1e-16) * flat);
+  const typename P::Int cut = row[5] < P(0);
+  if (mask_bits(cut) != 0) {  // rankine_clearly_elastic
+    const P f = cohesion * below, mean = P(0.5) * j2m1, shear = mu * sqrt(n2);
+    const P most = max(P(0) - row[5] * f, P(0) - row[2] * mean);
+    const auto holds = (mean + P(kLargestTension) * shear < P(0.9999) * f) &
+                       (P(1.224744871391589) * shear < P(0.9999) * most) &
+                       ~((alpha > P(0)) & (mean < P(0)));
+    inside = (inside & ~cut) | (holds & cut);
+  }
+  return inside & (alpha >= P(kAlphaMin)) & (alpha <= P(kAlphaMax));
 }
 
 // As far beyond the surface nacc_plastic begins to yield.
@@ -158,7 +168,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const Int holds = surely_elastic(row, cohesion, alpha, j2m1, n2);
       whole &= ~nacc | (peak < P(0));
       softens = plain & nacc & ~holds & (alpha >= P(0)) & (alpha <= P(kAlphaMax)) &
-                (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin));
+                (abs(j2m1) <= P(kSoftenedVolume)) & (row[2] >= P(kFrictionMin)) & (row[5] >= P(0));
       if constexpr (with_springs(kLaws))  // a yield that takes time is for the full map
         softens &= packet.load1(s.viscous, kViscousColumns, kViscousColumns - 1) <= P(0);
       alpha_after = alpha;
@@ -218,7 +228,7 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
     Int held = ~(relaxes & brittle) | surely_elastic(row, holding, alpha_after, change, away2);
     // yield_spring, of what has no strength
     Int slips = plain & ~held & (alpha_after >= P(0)) & (abs(change) <= P(kSoftenedVolume)) &
-                (row[2] >= P(kFrictionMin));
+                (row[2] >= P(kFrictionMin)) & (row[5] >= P(0));
     if (s.options.k == T(2) && mask_bits(slips) != 0) {
       const NaccMaterial<P> m{row[0], row[1], row[2], holding, row[4], row[5]};
       const Softened<P> now = softened_return(m, P(s.options.epsilon), away, sqrt(away2), change);

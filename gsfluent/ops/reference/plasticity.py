@@ -25,6 +25,7 @@ from gsfluent.ops.reference.nacc import (
     solve_alpha,
     yield_surface,
 )
+from gsfluent.ops.reference.rankine import rankine
 from gsfluent.ops.reference.tensors import (
     det_minus_one,
     diagonal,
@@ -111,9 +112,11 @@ def _neo_hookean(
     d, j2m1, log_j = t.d, t.j2m1, t.log_j
     p, q = -0.5 * m.kappa * j2m1, 1.5**0.5 * m.mu * t.n
     alpha = torch.where(nacc & valid, alpha.clamp(ALPHA_MIN, ALPHA_MAX), alpha)
+    cut = nacc & (m.shear_damage < 0.0)
+    started = alpha
     u, w = normalized(m, alpha, p, q)
     slack = 2e-15 if d.dtype == torch.float64 else 1e-6
-    plastic = valid & nacc & (u**2 + w**2 > 1.0 + slack)
+    plastic = valid & nacc & ~cut & (u**2 + w**2 > 1.0 + slack)
     if o.implicit:
         new_alpha = solve_alpha(m, o, log_j, t.n, p, q, alpha, root)
         if root is not None:  # at a limit it moves no further
@@ -127,6 +130,13 @@ def _neo_hookean(
     d = torch.where(plastic[:, None], r[:, None] * d, d)
     j2m1 = torch.where(plastic, -2.0 * p_new / m.kappa, j2m1)
     log_j = torch.where(plastic, 0.5 * torch.log1p(j2m1), log_j)
+    rows = (cut & valid).nonzero()[:, 0]
+    if rows.numel():
+        own = Material(*(column[rows] for column in m))
+        found = rankine(t.d[rows], t.j2m1[rows], started[rows], own, o.implicit)
+        d, j2m1 = d.index_copy(0, rows, found[0]), j2m1.index_copy(0, rows, found[1])
+        alpha, plastic = alpha.index_copy(0, rows, found[2]), plastic.index_copy(0, rows, found[3])
+        log_j = torch.where(plastic, 0.5 * torch.log1p(j2m1), log_j)
     rebuilt = (plastic | t.guarded)[:, None]
     strain = torch.where(rebuilt, strain_from_isochoric(d, log_j), t.e)
     stress = m.mu[:, None] * d + diagonal(0.5 * m.kappa * j2m1)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsfluent.materials import LARGEST, STEEPEST, Field, Material, phase_field
+from gsfluent.materials import LARGEST, STEEPEST, Field, Material, opening, phase_field
 from gsfluent.pipeline.matter.crack_band import ALPHA_MIN, BAND_CELLS, softening_energies
 
 STEP = 0.04
@@ -47,12 +47,16 @@ def brittle_rows(
     energy = sample(given)
     key = torch.cat([rows, torch.stack([alpha0, energy, step], dim=1)], dim=1)
     kinds, which = distinct_rows(key)
-    table, (alpha0, energy, step) = kinds[:, :8], kinds[:, 8:].unbind(dim=1)
+    table, (alpha0, energy, step) = kinds[:, :8].clone(), kinds[:, 8:].unbind(dim=1)
+    if material.surface == "rankine":
+        table[:, 3], table[:, 4], alpha0, _ = _opening(
+            material, table, alpha0, energy, (STEP * step).exp(), dx
+        )
+        return table[which], alpha0[which]
     strength = table[:, 1] * torch.sinh(table[:, 4] * alpha0.abs())
     hardening, alpha0, _ = softened(
         table, strength, energy, (STEP * step).exp(), dx, prefer=material.prefer
     )
-    table = table.clone()
     table[:, 4] = hardening
     return table[which], alpha0[which]
 
@@ -100,9 +104,22 @@ def kept_strength(material: Material, dx: float) -> float:
         [rows, alpha0.expand(shape).reshape(-1, 1), energy.expand(shape).reshape(-1, 1)], dim=1
     )
     table = distinct_rows(table)[0]
+    if material.surface == "rankine":
+        whole = torch.ones_like(table[:, 9])
+        return float(_opening(material, table, table[:, 8], table[:, 9], whole, dx)[3].min())
     strength = table[:, 1] * torch.sinh(table[:, 4] * table[:, 8].abs())
     limit = _held_strength(table[:, :8], strength, table[:, 9] / (BAND_CELLS * dx))
     return float((limit / strength).clamp(max=1.0).min())
+
+
+def _opening(
+    material: Material, rows: Tensor, alpha0: Tensor, energy: Tensor, weakness: Tensor, dx: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What :func:`gsfluent.materials.opening` says of rows on a grid, [M] each."""
+    mu, kappa, beta, xi = (rows[:, column] for column in (0, 1, 3, 4))
+    tensile = beta * kappa * torch.sinh(xi * alpha0.abs()) * weakness
+    young = 9.0 * kappa * mu / (3.0 * kappa + mu)
+    return opening(kappa, young, tensile, energy / (BAND_CELLS * dx), prefer=material.prefer)
 
 
 def softened(
