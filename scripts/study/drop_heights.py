@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 from drop_shapes import Shape, ball, bowl, box, egg, solid, tumbler, turned
-from rows import FIRST, add_law, preset_of
+from rows import FIRST, add_law, law_of, preset_of
 
 from gsfluent import materials, ops
 from gsfluent.data import Frame, Particles, Solid
@@ -422,7 +422,7 @@ def study(
     whole = [f for f in drop.falls if not f.broken and f.left and f.height <= gentle]
     whole = [f for f in whole if f.height == max(g.height for g in whole)]
     return {
-        "object": case.name, "law": drop.material.law, "stiffness": how,
+        "object": case.name, "law": law_of(drop.material), "stiffness": how,
         "device": name_of(options.device), "quick": options.quick,
         "seeds": options.seeds, "height": middle, "low": low,
         "high": None if math.isinf(high) else high,
@@ -531,14 +531,14 @@ def main(arguments: list[str] | None = None) -> int:
     begun = clock.perf_counter()
     done = {(r["object"], r["law"], r["stiffness"], r["quick"]) for r in records(output)}
 
-    def law_of(given: dict[str, Any]) -> str:
-        return preset_of(given["preset"], options.law).law
+    def breaks_by(given: dict[str, Any]) -> str:
+        return law_of(preset_of(given["preset"], options.law))
 
     todo = [
         (name, how)
         for how in options.stiffness
         for name in options.only or heights
-        if (name, law_of(heights[name]), how, options.quick) not in done and not options.only_table
+        if (name, breaks_by(heights[name]), how, options.quick) not in done and not options.only_table
         and heights[name].get("stiffness", how) == how
         and (how == "preset" or materials.get(heights[name]["preset"]).softening > 1.0)
     ]  # fmt: skip

@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 from fracture_resolution import LINES, MELON, PAGE, Trial, link_area
-from rows import NAMES, Row, add_law, numbers, preset_of, read, table
+from rows import NAMES, Row, add_law, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -206,7 +206,7 @@ def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     area = int(between.sum()) * link_area(run.links, matter.rest, float(volume.sum()))
     shares = frame.pieces.mass_fractions
     return {
-        "law": trial.matter.law, "height": trial.height, "cells": cells, "seed": seed,
+        "law": law_of(trial.matter), "height": trial.height, "cells": cells, "seed": seed,
         "device": device, "machine": machine(device), "dx": matter.dx,
         "points": matter.particles.count,
         "dissipated": report["per_frame"]["dissipated"][-1],
@@ -285,7 +285,7 @@ def paths_table(laws: Sequence[str], steps: int = 4000) -> str:
         )  # fmt: skip
         found = [energy_of_path(row, alpha, way, steps) for way in ways]
         target = float(preset.fracture_energy or 0.0) / (BAND_CELLS * dx)
-        out.append([name, preset.law, f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
+        out.append([name, law_of(preset), f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
     return table(head, out)
 
 
@@ -346,7 +346,7 @@ def main(argv: list[str] | None = None) -> int:
         for height in args.heights:
             for seed in range(args.seeds):
                 trial = dataclasses.replace(MELON, height=height, law=args.law)
-                if (trial.matter.law, height, cells, seed, args.device) in done:
+                if (law_of(trial.matter), height, cells, seed, args.device) in done:
                     continue
                 row = study(trial, cells, seed, args.device)
                 sys.stderr.write(f"{json.dumps(row)}\n")

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 from fracture_resolution import DROPS, LINES, PAGE, Trial
-from rows import Row, add_law, numbers, read, table
+from rows import Row, add_law, law_of, numbers, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -146,7 +146,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     trial = dataclasses.replace(DROPS[HEIGHT], law=args.law)
     for cells in args.cells:
-        key = {"law": trial.matter.law, "cells": cells, "device": args.device}
+        key = {"law": law_of(trial.matter), "cells": cells, "device": args.device}
         if any(all(r.get(k) == v for k, v in key.items()) for r in read(args.out)):
             continue
         row = {

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rows import Row, add_law, numbers, preset_of, read, table
+from rows import Row, add_law, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -304,7 +304,7 @@ def jobs(args: argparse.Namespace) -> list[Job]:
 
     def trial(part: str, name: str, one: Trial, cells: int, seed: int = 0) -> None:
         one = dataclasses.replace(one, law=args.law)
-        key = {"part": part, "name": name, "law": one.matter.law, "cells": cells, "seed": seed}
+        key = {"part": part, "name": name, "law": law_of(one.matter), "cells": cells, "seed": seed}
         points, steps = one.work(cells)
         found.append(Job(key, points, steps, partial(run_trial, one, cells, seed, args.device)))
 
@@ -331,7 +331,7 @@ def jobs(args: argparse.Namespace) -> list[Job]:
         for name in THROWN:
             for cells in args.bench_cells:
                 key = {
-                    "part": "bench", "name": name, "law": preset_of(THROWN[name], args.law).law,
+                    "part": "bench", "name": name, "law": law_of(preset_of(THROWN[name], args.law)),
                     "cells": cells, "seeds": args.bench_seeds,
                 }  # fmt: skip
                 points = 8.0 * 4.0 / 3.0 * math.pi * cells**3

@@ -20,7 +20,7 @@ from typing import Any
 
 from drop_heights import DATA, STIFFNESS, Case, Drop, name_of, records
 from drop_shapes import ball
-from rows import add_law, preset_of
+from rows import add_law, law_of, preset_of
 
 from gsfluent.figure.markdown import enter
 
@@ -42,7 +42,7 @@ def study(
     drop.fall([(given["height_m"], 0)], 1e9)
     fall = drop.falls[0]
     return {
-        "object": name, "law": drop.material.law, "stiffness": how, "cells": cells,
+        "object": name, "law": law_of(drop.material), "stiffness": how, "cells": cells,
         "height": given["height_m"], "restitution": fall.restitution, "left": fall.left,
         "broken": fall.broken, "ever": fall.ever, "shaking": fall.shaking,
         "verdict": drop.verdicts[0], "softening": drop.material.softening, "steps": drop.steps,
@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> int:
     done = {tuple(r[k] for k in keys) for r in records(options.output)}
     wanted = [
         (name, how, cells) for cells in options.cells for how in STIFFNESS for name in options.only
-        if (name, preset_of(literature[name]["preset"], options.law).law, how, cells) not in done
+        if (name, law_of(preset_of(literature[name]["preset"], options.law)), how, cells) not in done
         and not options.only_table
     ]  # fmt: skip
     options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,8 @@ from gsfluent import materials
 from gsfluent.materials import Material
 
 Row = dict[str, Any]
-NAMES = ("nacc", "rankine")
+NAMES = {"nacc": "cam_clay", "rankine": "rankine"}
+"""Laws by which brittle matter breaks, and the yield surface of each."""
 FIRST = "nacc"
 """Law of records that name none: there was no other."""
 
@@ -21,7 +22,7 @@ FIRST = "nacc"
 def add_law(parser: argparse.ArgumentParser) -> None:
     """Let a study be asked for a law."""
     parser.add_argument(
-        "--law", choices=NAMES, default="", help="by which matter breaks; default: its preset's"
+        "--law", choices=[*NAMES], default="", help="by which matter breaks; default: its preset's"
     )
 
 
@@ -33,7 +34,14 @@ def preset_of(name: str, law: str = "") -> Material:
         law: Of :data:`NAMES`, or none: that of the preset. What breaks by none of them stays.
     """
     material = materials.get(name)
-    return material.override(law=law) if law and material.law in NAMES else material
+    if not law or material.law != "nacc" or law_of(material) == law:
+        return material
+    return material.override(surface=NAMES[law])
+
+
+def law_of(material: Material) -> str:
+    """Name of the law by which a material breaks."""
+    return "rankine" if material.surface == "rankine" else material.law
 
 
 def read(path: Path) -> list[Row]:
