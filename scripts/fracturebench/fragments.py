@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "study"))
-from fracture_resolution import numbers, thrown
+from fracture_resolution import thrown
+from rows import numbers
 
 from gsfluent.figure.markdown import enter
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png

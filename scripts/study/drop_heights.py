@@ -24,6 +24,7 @@ from typing import Any
 
 import torch
 from drop_shapes import Shape, ball, bowl, box, egg, solid, tumbler, turned
+from rows import FIRST, add_law, law_of, preset_of
 
 from gsfluent import materials, ops
 from gsfluent.data import Frame, Particles, Solid
@@ -180,12 +181,12 @@ class Drop:
     """One object with one stiffness on one grid."""
 
     def __init__(
-        self, case: Case, given: dict[str, Any], how: str, device: str, coarse: bool
+        self, case: Case, given: dict[str, Any], how: str, device: str, coarse: bool, law: str = ""
     ) -> None:
         self.case, self.device, self.how = case, device, how
         self.dx = case.spacing(coarse)
         self.body: Solid = solid(case.shape, 0.5 * self.dx)
-        self.material = stiff(materials.get(given["preset"]), how).override(prefer=case.prefer)
+        self.material = stiff(preset_of(given["preset"], law), how).override(prefer=case.prefer)
         if case.name.startswith("egg"):
             self.material = thicker(self.material, SHELL, given["mass_kg"], self.body.volume)
         self.points = round(8 * self.body.volume / self.dx**3)
@@ -403,7 +404,7 @@ def study(
     case: Case, given: dict[str, Any], how: str, options: argparse.Namespace
 ) -> dict[str, Any] | None:
     """The record of one object with one stiffness; None where only the work is asked for."""
-    drop = Drop(case, given, how, options.device, options.quick)
+    drop = Drop(case, given, how, options.device, options.quick, options.law)
     start = float(given["height_m"] if "height_m" in given else given["survives_m"])
     ladder = LADDER[::2] if options.quick else LADDER
     work = drop.work(len(ladder)) + drop.work(4 * options.seeds)
@@ -421,8 +422,9 @@ def study(
     whole = [f for f in drop.falls if not f.broken and f.left and f.height <= gentle]
     whole = [f for f in whole if f.height == max(g.height for g in whole)]
     return {
-        "object": case.name, "stiffness": how, "device": name_of(options.device),
-        "quick": options.quick, "seeds": options.seeds, "height": middle, "low": low,
+        "object": case.name, "law": law_of(drop.material), "stiffness": how,
+        "device": name_of(options.device), "quick": options.quick,
+        "seeds": options.seeds, "height": middle, "low": low,
         "high": None if math.isinf(high) else high,
         "restitution": sum(f.restitution for f in whole) / len(whole) if whole else None,
         "restitution_at": whole[0].height if whole else None,
@@ -444,7 +446,7 @@ def name_of(device: str) -> str:
 def records(path: Path) -> list[dict[str, Any]]:
     """The lines of a file, if it is there."""
     lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return [json.loads(line) for line in lines if line.strip()]
+    return [{"law": FIRST, **json.loads(line)} for line in lines if line.strip()]
 
 
 def height_cell(row: dict[str, Any]) -> str:
@@ -467,12 +469,16 @@ def ratio_cell(row: dict[str, Any], given: dict[str, Any]) -> str:
 
 def table(rows: list[dict[str, Any]], heights: dict[str, dict[str, Any]]) -> str:
     """Markdown: every object and stiffness."""
-    head = ("object", "stiffness", "literature m (kind)", "ours m", "ratio", "restitution",
+    head = ("object", "law", "stiffness", "literature m (kind)", "ours m", "ratio", "restitution",
             "literature", "broken mass below, above", "parted", "cells", "points", "kept", "steps",
             "seconds")  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     order = {name: i for i, name in enumerate(heights)}
-    for row in sorted(rows, key=lambda r: (order[r["object"]], STIFFNESS.index(r["stiffness"]))):
+
+    def place(row: dict[str, Any]) -> tuple[int, int, str]:
+        return order[row["object"]], STIFFNESS.index(row["stiffness"]), row["law"]
+
+    for row in sorted(rows, key=place):
         given = heights[row["object"]]
         asked = given.get("height_m", given.get("survives_m"))
         ever = [
@@ -482,7 +488,7 @@ def table(rows: list[dict[str, Any]], heights: dict[str, dict[str, Any]]) -> str
         bounce = row["restitution"]
         soft = "real" if row["softening"] == 1.0 else f"1/{row['softening']:g}"
         cells = [
-            row["object"].replace("_", " "), soft,
+            row["object"].replace("_", " "), row["law"], soft,
             f"{'' if 'height_m' in given else '> '}{asked:g} ({given['kind']})",
             height_cell(row), ratio_cell(row, given), "-" if bounce is None else f"{bounce:.2f}",
             f"{given['restitution']:g}",
@@ -506,6 +512,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--only", nargs="+", choices=sorted(heights), help="these objects")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    add_law(parser)
     parser.add_argument("--seeds", type=int, default=3, help="specimens at a height, at most 5")
     parser.add_argument("--stiffness", nargs="+", choices=STIFFNESS, default=list(STIFFNESS))
     parser.add_argument("--quick", action="store_true", help="half the cells, every second height")
@@ -522,12 +529,16 @@ def main(arguments: list[str] | None = None) -> int:
     kind = "cuda" if options.device.startswith("cuda") else "cpu"
     output = options.output or DATA / f"drop_heights_{kind}.jsonl"
     begun = clock.perf_counter()
-    done = {(r["object"], r["stiffness"], r["quick"]) for r in records(output)}
+    done = {(r["object"], r["law"], r["stiffness"], r["quick"]) for r in records(output)}
+
+    def breaks_by(given: dict[str, Any]) -> str:
+        return law_of(preset_of(given["preset"], options.law))
+
     todo = [
         (name, how)
         for how in options.stiffness
         for name in options.only or heights
-        if (name, how, options.quick) not in done and not options.only_table
+        if (name, breaks_by(heights[name]), how, options.quick) not in done and not options.only_table
         and heights[name].get("stiffness", how) == how
         and (how == "preset" or materials.get(heights[name]["preset"]).softening > 1.0)
     ]  # fmt: skip
@@ -551,7 +562,7 @@ def main(arguments: list[str] | None = None) -> int:
         report(len(todo), len(todo), "")
     if options.estimate:
         return 0
-    found = {(r["object"], r["stiffness"]): r for r in records(output)}
+    found = {(r["object"], r["law"], r["stiffness"]): r for r in records(output)}
     page = options.markdown
     text = page.read_text(encoding="utf-8") if page.is_file() else ""
     page.write_text(enter(text, f"drops_{kind}", table(list(found.values()), heights)), "utf-8")

@@ -17,17 +17,20 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from fracture_resolution import LINES, MELON, PAGE, Row, Trial, link_area, numbers, read, table
+from fracture_resolution import LINES, MELON, PAGE, Trial, link_area
+from rows import NAMES, Row, add_law, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
-from gsfluent import materials, ops
+from gsfluent import ops
 from gsfluent.figure.markdown import enter
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import machine
@@ -203,8 +206,9 @@ def study(trial: Trial, cells: int, seed: int, device: str = "cpu") -> Row:
     area = int(between.sum()) * link_area(run.links, matter.rest, float(volume.sum()))
     shares = frame.pieces.mass_fractions
     return {
-        "height": trial.height, "cells": cells, "seed": seed, "device": device,
-        "machine": machine(device), "dx": matter.dx, "points": matter.particles.count,
+        "law": law_of(trial.matter), "height": trial.height, "cells": cells, "seed": seed,
+        "device": device, "machine": machine(device), "dx": matter.dx,
+        "points": matter.particles.count,
         "dissipated": report["per_frame"]["dissipated"][-1],
         "torn": float(account.torn[ever].sum()), "pressed": float(account.pressed[ever].sum()),
         "yielded": float((account.torn + account.pressed)[~ever].sum()),
@@ -263,15 +267,15 @@ def energy_of_path(
     raise ValueError(f"energy_of_path: not broken by strains {before}; take other ones")
 
 
-def paths_table(steps: int = 4000) -> str:
+def paths_table(laws: Sequence[str], steps: int = 4000) -> str:
     """Markdown: energies of presets over the one that G_c stands for, by how they are strained."""
     head = (
-        "material", "Poisson's ratio", "sides held", "sides free, then held",
+        "material", "law", "Poisson's ratio", "sides held", "sides free, then held",
         "one side free, then held", "pulled along two axes, then held", "sheared, then opened",
     )  # fmt: skip
     out = []
-    for name, dx in SPACINGS.items():
-        preset = materials.get(name)
+    for (name, dx), law in itertools.product(SPACINGS.items(), laws):
+        preset = preset_of(name, law)
         row, _, alpha = rows_of(preset, torch.ones(1, dtype=torch.float64), dx)
         nu = float(preset.poisson_ratio)  # type: ignore[arg-type]
         free = -2.0 * nu / (1.0 - nu)
@@ -281,27 +285,29 @@ def paths_table(steps: int = 4000) -> str:
         )  # fmt: skip
         found = [energy_of_path(row, alpha, way, steps) for way in ways]
         target = float(preset.fracture_energy or 0.0) / (BAND_CELLS * dx)
-        out.append([name, f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
+        out.append([name, law_of(preset), f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
     return table(head, out)
 
 
 def page_table(rows: list[dict[str, Any]]) -> str:
     """Markdown: every fall."""
     head = (
-        "from m", "cells", "device", "lost J", "relaxed", "broken matter, torn",
+        "from m", "law", "cells", "device", "lost J", "relaxed", "broken matter, torn",
         "broken matter, pressed", "whole matter", "points and nodes, floor", "broken", "crushed",
         "pieces over 1 %", "torn / (A G_c)",
     )  # fmt: skip
-    energy = float(materials.get(MELON.material).fracture_energy or 0.0)
+    energy = float(MELON.matter.fracture_energy or 0.0)
     out = []
-    for r in sorted(rows, key=lambda r: (r["height"], r["cells"], r["device"], r["seed"])):
+    keys = ("height", "law", "cells", "device", "seed")
+    for r in sorted(rows, key=lambda r: [r[k] for k in keys]):
         parts = [r[k] for k in ("relaxed", "torn", "pressed", "yielded")]
         parts.append(r["dissipated"] - sum(parts))
         area = r["broken_volume"] / (2.0 * r["dx"])
         whole = 4.0 / 3.0 * torch.pi * float(torch.tensor(MELON.half).prod())
         out.append(
             [
-                f"{r['height']:g}", str(r["cells"]), r["device"], f"{r['dissipated']:.1f}",
+                f"{r['height']:g}", r["law"], str(r["cells"]), r["device"],
+                f"{r['dissipated']:.1f}",
                 *(f"{100.0 * part / r['dissipated']:.1f} %" for part in parts),
                 *(f"{100.0 * r[k] / whole:.1f} %" for k in ("broken_volume", "crushed_volume")),
                 str(r["pieces_over_1_percent"]),
@@ -328,18 +334,21 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--heights", type=float, nargs="+", default=[0.75, 3.0])
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    add_law(parser)
     parser.add_argument("--paths", action="store_true", help="only the table of paths")
     args = parser.parse_args(argv)
     if args.paths:
-        put("fracture resolution paths", paths_table())
+        put("fracture resolution paths", paths_table([args.law] if args.law else NAMES))
         return 0
-    done = {(r["height"], r["cells"], r["seed"], r["device"]) for r in read(args.out)}
+    keys = ("law", "height", "cells", "seed", "device")
+    done = {tuple(r[k] for k in keys) for r in read(args.out)}
     for cells in args.cells:
         for height in args.heights:
             for seed in range(args.seeds):
-                if (height, cells, seed, args.device) in done:
+                trial = dataclasses.replace(MELON, height=height, law=args.law)
+                if (law_of(trial.matter), height, cells, seed, args.device) in done:
                     continue
-                row = study(dataclasses.replace(MELON, height=height), cells, seed, args.device)
+                row = study(trial, cells, seed, args.device)
                 sys.stderr.write(f"{json.dumps(row)}\n")
                 with args.out.open("a", encoding="utf-8") as file:
                     file.write(json.dumps(row) + "\n")

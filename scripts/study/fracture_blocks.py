@@ -12,6 +12,7 @@ line per fall; the table is entered into the page of the resolution.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from fracture_resolution import DROPS, LINES, PAGE, Row, numbers, read, table
+from fracture_resolution import DROPS, LINES, PAGE, Trial
+from rows import Row, add_law, law_of, numbers, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -75,9 +77,8 @@ def measure(run: Run) -> Row:
     }  # fmt: skip
 
 
-def fall(cells: int, device: str) -> Row:
+def fall(trial: Trial, cells: int, device: str) -> Row:
     """Let it fall and count."""
-    trial = DROPS[HEIGHT]
     sim = Simulate(
         dx=2.0 * max(trial.half) / cells, seed=0, repair=False, splats=False, device=device
     )
@@ -114,19 +115,19 @@ def _timed(owner: Any, name: str, spent: dict[str, float], device: str) -> None:
 def page(rows: list[Row]) -> None:
     """Enter the table."""
     head = (
-        "cells", "blocks / intact", "of them reached", "pieces one by one, as at rest",
+        "law", "cells", "blocks / intact", "of them reached", "pieces one by one, as at rest",
         "as they lie", "without points astray", "pieces below 1 %", "theirs", "points astray",
         "looks, s of all",
     )  # fmt: skip
     lines = [
         [
-            str(r["cells"]),
+            r["law"], str(r["cells"]),
             *(f"{r[k] / r['intact']:.2f}" for k in ("stored", "reached", "rest", "now", "held")),
             str(r["small"]), f"{r['of_small'] / r['intact']:.2f}",
             f"{100.0 * r['astray'] / r['points']:.2g} %",
             f"{r['looks']:.1f} of {r['seconds']:.1f}",
         ]
-        for r in sorted(rows, key=lambda r: (r["device"], r["cells"]))
+        for r in sorted(rows, key=lambda r: (r["device"], r["law"], r["cells"]))
     ]  # fmt: skip
     text = enter(PAGE.read_text(encoding="utf-8"), "fracture resolution blocks", table(head, lines))
     with atomic_path(PAGE) as file:
@@ -141,13 +142,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, default=OUT)
     parser.add_argument("--cells", type=numbers, default=(16, 20, 24))
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    add_law(parser)
     args = parser.parse_args(argv)
+    trial = dataclasses.replace(DROPS[HEIGHT], law=args.law)
     for cells in args.cells:
-        key = {"cells": cells, "device": args.device}
+        key = {"law": law_of(trial.matter), "cells": cells, "device": args.device}
         if any(all(r.get(k) == v for k, v in key.items()) for r in read(args.out)):
             continue
         row = {
-            **key, "machine": machine(args.device), "commit": commit(), **fall(cells, args.device)
+            **key, "machine": machine(args.device), "commit": commit(),
+            **fall(trial, cells, args.device),
         }  # fmt: skip
         sys.stderr.write(f"{json.dumps(row)}\n")
         args.out.parent.mkdir(parents=True, exist_ok=True)

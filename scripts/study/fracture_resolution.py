@@ -17,16 +17,17 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from rows import Row, add_law, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
-from gsfluent import materials, ops
+from gsfluent import ops
 from gsfluent.data import SURFACE, Frame, Gaussians, Solid
 from gsfluent.figure.markdown import enter
 from gsfluent.figure.style import COLORS, OURS, new_figure, save_png
@@ -39,6 +40,7 @@ from gsfluent.fracturebench.statistics import MEASURES, Figures, distance, ensem
 from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import commit, machine
 from gsfluent.lab.frozen.answer import run_case
+from gsfluent.materials import Material
 from gsfluent.pipeline.matter.brittle import brittle_rows
 from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 from gsfluent.pipeline.simulate.stage import Simulate
@@ -51,7 +53,6 @@ PICTURE = ROOT / "docs" / "images" / "fracture_resolution.png"
 GRAVITY = 9.81
 VOXELS = 128  # along the longest edge: finer than what is told apart here
 PARTS = ("drop", "balls", "seeds", "loose", "bench")
-Row = dict[str, Any]
 
 
 # --- bodies ---
@@ -108,13 +109,14 @@ class Trial:
     shape: Callable[[Tensor], Tensor] = ball
     grips: float = 0.0  # speed at which its ends are pulled apart [m/s]
     plates: float = 0.0  # speed at which it is pressed onto the floor [m/s]
+    law: str = ""  # by which it breaks; that of its preset when empty
 
     def scene(self) -> Scene:
         """The scene; the body touches the floor when it falls or is pressed."""
         made = Scene(floor=0.0)
         up = self.half[2] if not self.grips else 4.0 * self.half[2]
         frame = Frame(torch.eye(3), torch.tensor([0.0, 0.0, up]), 1.0)
-        made.add(solid(self.half, self.shape), self.material, frame=frame)
+        made.add(solid(self.half, self.shape), self.matter, frame=frame)
         if self.height:
             made.add_event({"type": "drop", "height": self.height})
         if self.plates:
@@ -128,6 +130,11 @@ class Trial:
         return made
 
     @property
+    def matter(self) -> Material:
+        """What it is made of."""
+        return preset_of(self.material, self.law)
+
+    @property
     def begins(self) -> float:
         """When it lands, or 0 [s]."""
         return math.sqrt(2.0 * self.height / GRAVITY)
@@ -138,7 +145,7 @@ class Trial:
         share = math.pi / 6.0 if self.shape is ball else 1.0
         points = 8.0 * share * float(sizes.prod()) * cells**3
         dx = 2.0 * max(self.half) / cells
-        return points, self.seconds * 2.5 * materials.get(self.material).wave_speed / dx
+        return points, self.seconds * 2.5 * self.matter.wave_speed / dx
 
 
 MELON = Trial("fruit.watermelon", (0.125, 0.125, 0.115), 0.2, height=0.75)
@@ -185,8 +192,7 @@ def run_trial(trial: Trial, cells: int, seed: int, device: str) -> Row:
     area = int(between.sum()) * link_area(run.links, matter.rest, volume)
     per_frame = report["per_frame"]
     shares = frame.pieces.mass_fractions
-    material = materials.get(trial.material)
-    energy = float(material.fracture_energy or math.nan)
+    energy = float(trial.matter.fracture_energy or math.nan)
     broken = float(per_frame["broken_fraction"][-1])
     start = per_frame["kinetic"][0] + per_frame["gravity"][0] + per_frame["elastic"][0]
     return {
@@ -213,7 +219,9 @@ SPEED = 5.0
 _SCATTER, _LEVELS = 0.3, 16
 
 
-def thrown(name: str, radius: float, dx: float, per_cell: int, speed: float = SPEED) -> BenchScene:
+def thrown(
+    name: str, radius: float, dx: float, per_cell: int, speed: float = SPEED, *, law: str = ""
+) -> BenchScene:  # fmt: skip
     """A ball of a preset, of scattered strength, thrown on a plane.
 
     Args:
@@ -222,8 +230,9 @@ def thrown(name: str, radius: float, dx: float, per_cell: int, speed: float = SP
         dx: Node spacing [m].
         per_cell: Points per cell.
         speed: Over the one at which the material breaks; a quarter of its wave speed at most.
+        law: By which it breaks; that of its preset when empty.
     """
-    preset = materials.get(THROWN.get(name, name))
+    preset = preset_of(THROWN.get(name, name), law)
     points = lattice_ball(radius, dx, per_cell)
     factor = np.clip(1.0 + _SCATTER * shape_noise(points, 0.8 * radius, 3), 0.4, 1.6)
     low, high = float(factor.min()), float(factor.max())
@@ -260,10 +269,10 @@ def thrown(name: str, radius: float, dx: float, per_cell: int, speed: float = SP
 RADII = {"watermelon": 0.12, "chocolate": 0.03, "glass": 0.03}
 
 
-def run_bench(name: str, cells: int, seeds: int, device: str) -> Row:
+def run_bench(name: str, cells: int, seeds: int, device: str, law: str) -> Row:
     """An ensemble of throws on shifted grids."""
     radius = RADII[name]
-    build = partial(thrown, name, radius)
+    build = partial(thrown, name, radius, law=law)
     case = Case(f"thrown {name}", "fracture", "", radius / cells, build, lambda *_: (), ())
     begun = time.perf_counter()
     player = partial(run_case, device=device, cfl=0.5, dtype=torch.float32)
@@ -294,7 +303,8 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     found: list[Job] = []
 
     def trial(part: str, name: str, one: Trial, cells: int, seed: int = 0) -> None:
-        key = {"part": part, "name": name, "cells": cells, "seed": seed}
+        one = dataclasses.replace(one, law=args.law)
+        key = {"part": part, "name": name, "law": law_of(one.matter), "cells": cells, "seed": seed}
         points, steps = one.work(cells)
         found.append(Job(key, points, steps, partial(run_trial, one, cells, seed, args.device)))
 
@@ -320,24 +330,14 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     if "bench" in only:
         for name in THROWN:
             for cells in args.bench_cells:
-                key = {"part": "bench", "name": name, "cells": cells, "seeds": args.bench_seeds}
+                key = {
+                    "part": "bench", "name": name, "law": law_of(preset_of(THROWN[name], args.law)),
+                    "cells": cells, "seeds": args.bench_seeds,
+                }  # fmt: skip
                 points = 8.0 * 4.0 / 3.0 * math.pi * cells**3
-                make = partial(run_bench, name, cells, args.bench_seeds, args.device)
+                make = partial(run_bench, name, cells, args.bench_seeds, args.device, args.law)
                 found.append(Job(key, points, 80.0 * cells * args.bench_seeds, make))
     return found
-
-
-def read(path: Path) -> list[Row]:
-    """Lines of a file, none if it is not there; one that was cut off is left out."""
-    if not path.exists():
-        return []
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            sys.stderr.write(f"{path}: a line was cut off and is left out\n")
-    return rows
 
 
 def known(row: Row, key: Row) -> bool:
@@ -368,12 +368,6 @@ def run_all(todo: Sequence[Job], out: Path, device: str) -> None:
 # --- page ---
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
-    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
-
-
 def exponent(rows: Sequence[Row], what: str) -> float:
     """Least-squares exponent of a figure over dx; NaN where there are not two of it."""
     pairs = [(r["dx"], r[what]) for r in rows if r[what]]
@@ -394,15 +388,15 @@ def ratio(value: float | None) -> str:
 
 
 _HEAD = (
-    "body", "cells", "points", "steps", "s", "loose", "pieces", "over 1 %", "largest", "broken",
-    "energy lost / (A G_c)", "broken / (A dx)", "blocks / intact",
+    "body", "law", "cells", "points", "steps", "s", "loose", "pieces", "over 1 %", "largest",
+    "broken", "energy lost / (A G_c)", "broken / (A dx)", "blocks / intact",
 )  # fmt: skip
 
 
 def line(row: Row) -> list[str]:
     """A run as a line of a table."""
     return [
-        row["name"], str(row["cells"]), str(row["points"]), str(row["steps"]),
+        row["name"], row["law"], str(row["cells"]), str(row["points"]), str(row["steps"]),
         f"{row['seconds']:.1f}", percent(row["loose"]), str(row["pieces"]),
         str(row["pieces_over_1_percent"]), f"{row['largest']:.3f}", f"{row['broken']:.3f}",
         ratio(row["energy"]), ratio(row["band"]), f"{row['blocks'] / row['blocks_intact']:.2f}",
@@ -412,42 +406,50 @@ def line(row: Row) -> list[str]:
 def exponents(rows: Sequence[Row]) -> str:
     """Broken volume over dx, for every body."""
     out = []
-    for name in dict.fromkeys(r["name"] for r in rows):
-        mine = sorted((r for r in rows if r["name"] == name), key=lambda r: r["cells"])
+    for name, law in dict.fromkeys((r["name"], r["law"]) for r in rows):
+        mine = sorted(
+            (r for r in rows if (r["name"], r["law"]) == (name, law)), key=lambda r: r["cells"]
+        )
         grids = ", ".join(str(r["cells"]) for r in mine)
-        out.append((name, grids, f"{exponent(mine, 'broken_volume'):.2f}"))
-    return table(("body", "cells", "exponent of the broken volume over dx"), out)
+        out.append((name, law, grids, f"{exponent(mine, 'broken_volume'):.2f}"))
+    return table(("body", "law", "cells", "exponent of the broken volume over dx"), out)
 
 
 def seeds_table(rows: Sequence[Row]) -> str:
     """Pieces over a hundredth of the mass, means over seeds."""
     out = []
-    for cells in sorted({r["cells"] for r in rows}):
-        mine = [r for r in rows if r["cells"] == cells]
+    for law, cells in sorted({(r["law"], r["cells"]) for r in rows}):
+        mine = [r for r in rows if (r["law"], r["cells"]) == (law, cells)]
         counts = np.array([r["pieces_over_1_percent"] for r in mine], dtype=float)
         largest = np.array([r["largest"] for r in mine])
         loose = np.array([r["loose"] for r in mine])
         out.append(
             (
-                str(cells), str(len(mine)), f"{counts.mean():.2f}", f"{counts.std():.2f}",
+                law, str(cells), str(len(mine)), f"{counts.mean():.2f}", f"{counts.std():.2f}",
                 f"{largest.mean():.3f}", f"{largest.std():.3f}", percent(float(loose.mean())),
             )
         )  # fmt: skip
-    head = ("cells", "seeds", "pieces over 1 %", "+-", "largest", "+-", "loose")
+    head = ("law", "cells", "seeds", "pieces over 1 %", "+-", "largest", "+-", "loose")
     return table(head, out)
 
 
-def ladder(rows: Sequence[Row], name: str) -> list[tuple[Row, list[Figures]]]:
-    """The ensembles of a material, finest last."""
-    mine = sorted((r for r in rows if r["name"] == name), key=lambda r: r["cells"])
+def ladder(rows: Sequence[Row], kind: tuple[str, str]) -> list[tuple[Row, list[Figures]]]:
+    """The ensembles of a material and law, finest last."""
+    mine = sorted((r for r in rows if (r["name"], r["law"]) == kind), key=lambda r: r["cells"])
     return [(r, [Figures.of_plain(p) for p in r["runs"]]) for r in mine]
+
+
+def kinds(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """Materials and laws, in the order of :data:`THROWN`."""
+    laws = sorted({r["law"] for r in rows})
+    return [(name, law) for name in THROWN for law in laws if ladder(rows, (name, law))]
 
 
 def bench_table(rows: Sequence[Row]) -> str:
     """Distances of coarser grids from the finest."""
     out = []
-    for name in THROWN:
-        steps = ladder(rows, name)
+    for kind in kinds(rows):
+        steps = ladder(rows, kind)
         if not steps or len(steps[-1][1]) < 3:
             continue
         reference = steps[-1][1]
@@ -456,13 +458,13 @@ def bench_table(rows: Sequence[Row]) -> str:
             last = row is steps[-1][0]
             cells = [f"band {found[m].band:.3f}" if last else str(found[m]) for m in MEASURES]
             count = float(np.median([(f.pieces > 0.01).sum() for f in runs]))
-            out.append((name, f"R / {row['cells']}", *cells, f"{count:.0f}"))
-    return table(("material", "dx", *MEASURES, "pieces over 1 %"), out)
+            out.append((*kind, f"R / {row['cells']}", *cells, f"{count:.0f}"))
+    return table(("material", "law", "dx", *MEASURES, "pieces over 1 %"), out)
 
 
 def draw(rows: Sequence[Row]) -> None:
     """Mass over pieces with the run-to-run band, and distances over dx, of every material."""
-    names = [n for n in THROWN if len(ladder(rows, n)) > 1]
+    names = [kind for kind in kinds(rows) if len(ladder(rows, kind)) > 1]
     if not names:
         return
     places = np.geomspace(1e-4, 1.0, 200)
@@ -483,7 +485,7 @@ def draw(rows: Sequence[Row]) -> None:
                 upper.plot(places, np.median([below(f) for f in runs], axis=0), color=color,
                            lw=1.2, label=f"R / {other['cells']}")  # fmt: skip
             upper.set(
-                title=name.capitalize(),
+                title=", ".join(name).capitalize(),
                 xscale="log",
                 ylim=(0.0, 1.02),
                 xlabel="mass of a piece over the whole",
@@ -514,7 +516,7 @@ def page(lines: Path, device: str) -> int:
 
     def of(*parts: str) -> list[Row]:
         return sorted(
-            (r for r in rows if r["part"] in parts), key=lambda r: (r["name"], r["cells"])
+            (r for r in rows if r["part"] in parts), key=lambda r: (r["name"], r["law"], r["cells"])
         )
 
     text = PAGE.read_text(encoding="utf-8")
@@ -540,11 +542,6 @@ def page(lines: Path, device: str) -> int:
     return 0
 
 
-def numbers(text: str) -> tuple[int, ...]:
-    """Read ``20,40``."""
-    return tuple(sorted(int(n) for n in text.split(",") if n))
-
-
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run it."""
     parser = argparse.ArgumentParser(
@@ -553,6 +550,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, default=LINES)
     parser.add_argument("--only", default="", help=f"of {','.join(PARTS)}")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    add_law(parser)
     parser.add_argument("--cells", type=numbers, default=(20, 40, 80, 120))
     parser.add_argument("--ball-cells", type=numbers, default=(20, 32, 48, 64))
     parser.add_argument("--seed-cells", type=numbers, default=(20, 40, 80))

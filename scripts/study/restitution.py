@@ -11,6 +11,7 @@ per body, stiffness and grid; what is there is not run again. What the literatur
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tomllib
@@ -19,6 +20,7 @@ from typing import Any
 
 from drop_heights import DATA, STIFFNESS, Case, Drop, name_of, records
 from drop_shapes import ball
+from rows import add_law, law_of, preset_of
 
 from gsfluent.figure.markdown import enter
 
@@ -30,31 +32,35 @@ GOOD, SAME = 0.15, 0.1
 """Distance from the literature that counts as right, and between grids that counts as the same."""
 
 
-def study(name: str, given: dict[str, Any], how: str, cells: int, device: str) -> dict[str, Any]:
+def study(
+    name: str, given: dict[str, Any], how: str, cells: int, device: str, law: str
+) -> dict[str, Any]:  # fmt: skip
     """The record of one landing."""
     fruit = given["preset"].startswith("fruit.")
     case = Case(name, ball(given["diameter_m"]), float(cells), TRAVERSALS, fruit=fruit)
-    drop = Drop(case, {"preset": given["preset"]}, how, device, False)
+    drop = Drop(case, {"preset": given["preset"]}, how, device, False, law)
     drop.fall([(given["height_m"], 0)], 1e9)
     fall = drop.falls[0]
     return {
-        "object": name, "stiffness": how, "cells": cells, "height": given["height_m"],
-        "restitution": fall.restitution, "left": fall.left, "broken": fall.broken,
-        "ever": fall.ever, "shaking": fall.shaking, "verdict": drop.verdicts[0],
-        "softening": drop.material.softening, "steps": drop.steps, "seconds": drop.seconds,
-        "device": name_of(device),
+        "object": name, "law": law_of(drop.material), "stiffness": how, "cells": cells,
+        "height": given["height_m"], "restitution": fall.restitution, "left": fall.left,
+        "broken": fall.broken, "ever": fall.ever, "shaking": fall.shaking,
+        "verdict": drop.verdicts[0], "softening": drop.material.softening, "steps": drop.steps,
+        "seconds": drop.seconds, "device": name_of(device),
     }  # fmt: skip
 
 
 def table(rows: list[dict[str, Any]], literature: dict[str, dict[str, Any]]) -> str:
     """Markdown: every body and stiffness, over the grids."""
-    head = ("body", "stiffness", "height m", "literature", *(f"{n} cells" for n in CELLS),
+    head = ("body", "law", "stiffness", "height m", "literature", *(f"{n} cells" for n in CELLS),
             "between grids", "farthest off")  # fmt: skip
     lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
     right = same = count = 0
+    laws = sorted({r["law"] for r in rows})
     for name, given in literature.items():
-        for how in STIFFNESS:
-            found = {r["cells"]: r for r in rows if (r["object"], r["stiffness"]) == (name, how)}
+        for how, law in itertools.product(STIFFNESS, laws):
+            kind = {"object": name, "stiffness": how, "law": law}
+            found = {r["cells"]: r for r in rows if r.items() >= kind.items()}
             if not found:
                 continue
             speeds = [r["restitution"] for r in found.values() if r["left"]]
@@ -65,7 +71,7 @@ def table(rows: list[dict[str, Any]], literature: dict[str, dict[str, Any]]) -> 
             right += abs(off) <= GOOD
             soft = next(iter(found.values()))["softening"]
             cells = [
-                name, "real" if soft == 1.0 else f"1/{soft:g}", f"{given['height_m']:g}",
+                name, law, "real" if soft == 1.0 else f"1/{soft:g}", f"{given['height_m']:g}",
                 f"{given['restitution']:g}",
                 *(f"{found[n]['restitution']:.2f}" if n in found else "-" for n in CELLS),
                 f"{spread:.2f}", f"{off:+.2f}",
@@ -89,19 +95,22 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--only", nargs="+", choices=list(literature), default=list(literature))
     parser.add_argument("--cells", nargs="+", type=int, choices=CELLS, default=list(CELLS))
+    add_law(parser)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("-o", "--output", type=Path, default=DATA / "restitution.jsonl")
     parser.add_argument("--markdown", type=Path, default=PAGE, help="page to enter the table into")
     parser.add_argument("--only-table", action="store_true", help="run nothing")
     options = parser.parse_args(arguments)
-    done = {(r["object"], r["stiffness"], r["cells"]) for r in records(options.output)}
+    keys = ("object", "law", "stiffness", "cells")
+    done = {tuple(r[k] for k in keys) for r in records(options.output)}
     wanted = [
         (name, how, cells) for cells in options.cells for how in STIFFNESS for name in options.only
-        if (name, how, cells) not in done and not options.only_table
+        if (name, law_of(preset_of(literature[name]["preset"], options.law)), how, cells) not in done
+        and not options.only_table
     ]  # fmt: skip
     options.output.parent.mkdir(parents=True, exist_ok=True)
     for name, how, cells in wanted:
-        row = study(name, literature[name], how, cells, options.device)
+        row = study(name, literature[name], how, cells, options.device, options.law)
         with options.output.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         sys.stdout.write(

@@ -263,7 +263,7 @@ def test_pieces_are_looked_for_as_often_as_anything_moves(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
-def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
+def test_a_melon_breaks_into_the_same_pieces_on_several_ranks_and_threads(
     device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[Any] = []
@@ -275,17 +275,23 @@ def test_a_melon_breaks_into_the_same_pieces_on_several_ranks(
         return counted(solver)
 
     monkeypatch.setattr(ops.Solver, "counters", counters)
-    for ranks in (1, 3):
+    before = torch.get_num_threads()
+    for ranks, threads in ((1, 1), (3, 1), *([(1, 2)] if device == "cpu" else [])):
         monkeypatch.setitem(ops.Solver.__init__.__kwdefaults__, "ranks", ranks)
+        torch.set_num_threads(threads)
         stage = Simulate(dx=DX, splats=False, device=device)
-        *_, last = stage(dropped(), fps=20, seconds=0.75)
+        try:
+            *_, last = stage(dropped(), fps=20, seconds=0.75)
+        finally:
+            torch.set_num_threads(before)
         ends.append(last)
-    one, several = ends
+    one = ends[0]
     assert used == {1, 3} and one.stats["pieces"] > 1 and one.stats["broken_fraction"] > 0.1
-    for name in ("position", "velocity", "strain", "alpha"):
-        assert torch.equal(getattr(several.particles, name), getattr(one.particles, name)), name
-    assert torch.equal(several.fragments, one.fragments)
-    assert several.stats == one.stats
+    for other in ends[1:]:
+        for name in ("position", "velocity", "strain", "alpha"):
+            assert torch.equal(getattr(other.particles, name), getattr(one.particles, name)), name
+        assert torch.equal(other.fragments, one.fragments)
+        assert other.stats == one.stats
 
 
 @pytest.mark.cuda

@@ -36,17 +36,21 @@ def fracture_energy(length: float) -> float:
     return length * TENSILE**2 / YOUNG
 
 
-def stone(length: float, compressive: float = COMPRESSIVE) -> Material:
+def stone(
+    length: float, compressive: float = COMPRESSIVE, surface: str = "cam_clay"
+) -> Material:
     """A brittle material of which ``E G_c / s^2``, s its tensile strength, is a length [m].
 
     Args:
         length: [m].
         compressive: Its strength in compression [Pa].
+        surface: At which it yields, of :class:`gsfluent.materials.Material`.
     """
     return Material(
         "stone", young_modulus=YOUNG, poisson_ratio=POISSON, density=DENSITY, friction_angle=50.0,
         tensile_strength=TENSILE, compressive_strength=compressive,
-        fracture_energy=fracture_energy(length), shear_damage=0.0,
+        fracture_energy=fracture_energy(length), surface=surface,
+        shear_damage=0.0 if surface == "cam_clay" else None,
     )  # fmt: skip
 
 
@@ -77,7 +81,14 @@ class Crack:
     beside: float = 0.0  # of the energy, what matter took that did not break
 
 
-def pull_apart(cells: int, *, length: float = 0.3, pull: float = 5e-4, shift: float = 0.0) -> Crack:
+def pull_apart(
+    cells: int,
+    *,
+    length: float = 0.3,
+    pull: float = 5e-4,
+    shift: float = 0.0,
+    surface: str = "cam_clay",
+) -> Crack:
     """Pull a bar of one metre apart, in uniaxial strain, a fifth weaker in the middle.
 
     Args:
@@ -85,9 +96,10 @@ def pull_apart(cells: int, *, length: float = 0.3, pull: float = 5e-4, shift: fl
         length: ``E G_c / s^2`` [m].
         pull: Speed of each grip over that of a pressure wave.
         shift: Position of the bar relative to the nodes [dx].
+        surface: Of :func:`stone`.
     """
     dx = 1.0 / cells
-    material = stone(length)
+    material = stone(length, surface=surface)
     points = box([0.0, 0.0, 0.0], [1.0, dx, dx], 0.5 * dx)
     away = points[:, 0] - 0.5
     weakness = 1.0 - 0.2 * torch.exp(-((away / 0.1) ** 2))
@@ -130,6 +142,7 @@ def open_slowly(
     jitter: float = 0.0,
     crossings: float = 18.0,
     compressive: float = COMPRESSIVE,
+    surface: str = "cam_clay",
 ) -> Crack:
     """Wedge the arms of a notched slab apart, so that a crack runs between them.
 
@@ -146,9 +159,10 @@ def open_slowly(
         crossings: Duration in travel times of a pressure wave along the slab.
         compressive: Strength in compression [Pa]. The yield ellipse through it and the tensile
             strength is what matter around a tip holds, which is pulled along two axes.
+        surface: Of :func:`stone`.
     """
     dx, height, notch = 1.0 / cells, 0.375, 0.25
-    material = stone(length, compressive)
+    material = stone(length, compressive, surface)
     points = sheet([0.0, 0.0], [1.0, height], dx)
     middle = points[:, 1] - 0.5 * height
     keep = (points[:, 0] > notch) | (middle.abs() > 1.01 * dx)
@@ -201,6 +215,7 @@ def bend(
     speed: float = 2e-4,
     sag: float = 0.016,
     span: float = 3.0,
+    surface: str = "cam_clay",
 ) -> list[tuple[float, float]]:
     """Bend a notched beam between two rollers below and one above until it has parted.
 
@@ -214,12 +229,13 @@ def bend(
         speed: Of the upper roller over that of a pressure wave, after a ramp.
         sag: Its way at the end [m].
         span: Between the lower rollers [m].
+        surface: Of :func:`stone`.
 
     Returns:
         Sag [m] and load [N per metre of width], means over short times.
     """
     dx = 1.0 / cells
-    material = stone(length)
+    material = stone(length, surface=surface)
     half = 0.5 * span + 0.25
     points = sheet([-half, 0.0], [2.0 * half, 1.0], dx)
     x, y = points[:, 0], points[:, 1]
