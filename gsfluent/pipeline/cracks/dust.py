@@ -85,6 +85,8 @@ LANDED, FALLING = 1.2, 2.4
 know nothing of it: the grid feels the floor from a cell and a half away."""
 JUICE = 0.85
 """Share of the mean colour of the flesh in that of a drop: juice is mixed, wherever it is from."""
+DARKEST = 0.5
+"""Lightness of the darkest chips of what is dry, over that of its inside."""
 STILL = 1e-3
 """A point that has gone less than this since the last frame [edges] lies still."""
 _ASKED = 4096  # points of a body that are asked for its mean colour, about
@@ -149,7 +151,8 @@ class Dust:
             wet = materials.wet(self._scene.bodies[number].material.name)
             least, most = self._sizes[number]
             chips, mist = grains(mine, self.edge[mine], least, most, wet)
-            self._grains.append(chips.at(self._matter.rest[chips.row], color))
+            paint = color if wet else functools.partial(self._dry, number, color)
+            self._grains.append(chips.at(self._matter.rest[chips.row], paint))
             shade = functools.partial(self._pale, number, wet, color)
             self._grains.append(mist.at(self._matter.rest[mist.row], shade))
 
@@ -160,11 +163,26 @@ class Dust:
         own = self._juice(number, color, places) if wet else color(places)
         return torch.lerp(own, torch.ones_like(own), PALE)
 
+    def _dry(self, number: int, color: Callable[[Tensor], Tensor], places: Tensor) -> Tensor:
+        """Colours [G, 3] of chips of what is dry, none of which is much darker than its inside.
+
+        The darkest skin of a capture lay in a hollow that no light reached: in the open its chips
+        would be black specks.
+        """
+        own, inside = color(places), self._inside(number, color, places)
+        least, light = DARKEST * inside.mean(), own.mean(dim=1, keepdim=True)
+        share = (least - light) / (inside.mean() - light).clamp(min=1e-6)
+        return torch.lerp(own, inside.expand_as(own), share.clamp(0.0, 1.0))
+
+    def _inside(self, number: int, color: Callable[[Tensor], Tensor], like: Tensor) -> Tensor:
+        """Mean colour [3] of the deeper half of a body, kept."""
+        if number not in self._mean:
+            self._mean[number] = self._flesh(number, color).to(like)
+        return self._mean[number]
+
     def _juice(self, number: int, color: Callable[[Tensor], Tensor], places: Tensor) -> Tensor:
         """Colours [G, 3] of drops of a body that come from places at rest [m], [G, 3]."""
-        if number not in self._mean:
-            self._mean[number] = self._flesh(number, color).to(places)
-        return torch.lerp(color(places), self._mean[number], JUICE)
+        return torch.lerp(color(places), self._inside(number, color, places), JUICE)
 
     def _flesh(self, number: int, color: Callable[[Tensor], Tensor]) -> Tensor:
         """Mean colour [3] of the deeper half of a body: a rind gives no juice."""

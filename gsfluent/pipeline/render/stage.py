@@ -52,8 +52,6 @@ _RESOLUTIONS = (512, 1024)
 # Room of the occupancy grid for matter that flies apart; beyond, a new one is laid out.
 _ROOM = 1.25
 _NEAR = 0.01  # camera z [m] from which on splats are drawn
-# Cosine to the ray from which on a blended normal is that of the far side.
-_AWAY = 0.3
 
 
 @dataclass(frozen=True)
@@ -240,7 +238,7 @@ class Render(Stage):
             given, film = seen.normal, None
             if wet is not None:
                 given, film = given[..., :-1].contiguous(), given[..., -1]
-            vectors, gloss = _gloss(lighting, _facing(given, view), alpha)
+            vectors, gloss = _gloss(lighting, given, alpha)
             planes = (image, alpha, depth, vectors)
             if liquid is not None and liquid.opaque and whole:
                 liquid, planes, gloss = liquid.shaded_with(planes, gloss)
@@ -532,23 +530,6 @@ def _shaded(
         occlusion=lit.occlusion,
         studio=None if studio is None else studio.packed(seen[0]),
     )
-
-
-def _facing(given: Tensor, view: tuple[Tensor, Tensor]) -> Tensor:
-    """Blended vectors [H, W, K], the normals among them, [..., :3], turned to the eye.
-
-    What is seen faces the eye. In glass or a thin shell the far side can outweigh the near one, and
-    would be lit from behind; at an outline a normal may look a little away.
-    """
-    normal, (viewmat, lens) = given[..., :3], view
-    rows, columns = given.shape[:2]
-    y = ((torch.arange(rows, device=given.device) + 0.5 - lens[1, 2]) / lens[1, 1])[:, None]
-    x = (torch.arange(columns, device=given.device) + 0.5 - lens[0, 2]) / lens[0, 0]
-    own = (normal @ viewmat[:3, :3].T).unbind(dim=2)
-    along = own[0] * x + own[1] * y + own[2]
-    away = along > _AWAY * normal.norm(dim=2) * (x * x + y * y + 1.0).sqrt()
-    sign = torch.where(away, -1.0, 1.0)[..., None].to(given)
-    return torch.cat([sign * normal, given[..., 3:]], dim=2)
 
 
 def _gloss(lighting: Lighting, given: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -12,11 +12,13 @@ from gsfluent.draw import draw
 from gsfluent.pipeline.cracks.dust import (
     _ROOM,
     BETA,
+    DARKEST,
     FINE,
     JUICE,
     MIST,
     MOST,
     THINNEST,
+    Dust,
     Grains,
     grains,
     per_point,
@@ -286,6 +288,17 @@ def test_mist_of_juice_has_the_colour_of_the_flesh(bound: Carry) -> None:
     torch.testing.assert_close(
         drops, torch.lerp(rind, flesh, JUICE).expand(5, 3), atol=0.03, rtol=0
     )
+
+
+def test_chips_of_what_is_dry_are_no_black_specks() -> None:
+    bound = binding(material="bone")
+    assert bound.scene is not None
+    dust = Dust(bound.scene, bound.matter)
+    flesh = dust._flesh(0, lambda p: torch.full_like(p, 0.6)).float()
+    shown = torch.tensor([[0.02, 0.0, 0.0], [0.5, 0.45, 0.4], [0.9, 0.9, 0.9]])
+    chips = dust._dry(0, lambda p: shown, torch.zeros(3, 3))
+    assert float(chips[0].mean()) == pytest.approx(DARKEST * float(flesh.mean()), rel=1e-3)
+    torch.testing.assert_close(chips[1:], shown[1:])
 
 
 def test_what_lies_scatters_no_more(bound: Carry) -> None:
