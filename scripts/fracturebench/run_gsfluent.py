@@ -29,7 +29,9 @@ from gsfluent.fracturebench.scene import SceneError
 from gsfluent.lab.charts.run_case import ANSWER, Question, answer_task
 from gsfluent.sweep.engine import map as sweep_map
 
-METHODS = {"nacc": "gsfluent", "phase_field": "gsfluent phase field"}
+METHODS = {
+    "nacc": "gsfluent", "rankine": "gsfluent rankine", "phase_field": "gsfluent phase field",
+}  # fmt: skip
 """Names of gsfluent's laws of breaking in the table."""
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")
 
@@ -88,9 +90,7 @@ def main() -> int:
         help="move the points on the grid by this, along the axes without a collider",
     )  # fmt: skip
     parser.add_argument("--one-field", action="store_true", help="all bodies in one velocity field")
-    parser.add_argument(
-        "--law", choices=("nacc", "phase_field"), default="nacc", help="of what breaks"
-    )
+    parser.add_argument("--law", choices=[*METHODS], default="nacc", help="of what breaks")
     parser.add_argument(
         "--contact", choices=("nodes", "points"), default="nodes",
         help="what separating colliders and other bodies push",

@@ -16,9 +16,10 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
-from gsfluent.materials import Material, phase_field
+from gsfluent.materials import Material, opening, phase_field
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 
 
 def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
@@ -43,12 +44,36 @@ def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
     return phase_field.rows(material, at, torch.ones(1, dtype=torch.float64), dx)[0]
 
 
+def _rankine(m: Mapping[str, Any], dx: float) -> tuple[dict[str, float], float]:
+    """Columns of a brittle row by Rankine's surface, and its alpha0.
+
+    Strength and fracture energy are those that the row states; in compression it holds what its
+    ellipse does in one axis.
+    """
+    young, nu = float(m["young_modulus"]), float(m["poisson_ratio"])
+    kappa = young / (3.0 * (1.0 - 2.0 * nu))
+    slope, beta = float(m["friction"]), float(m["cohesion"])
+    tensile = float(m["tensile_strength"])
+    p0 = kappa * math.sinh(-float(m["hardening"]) * float(m["alpha"]))
+    # q = 3 p on q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0
+    a = 9.0 * (1.0 + 2.0 * beta) + slope**2
+    b, c = slope**2 * (beta - 1.0) * p0, -(slope**2) * beta * p0**2
+    compressive = 3.0 * (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
+    energy = float(m["fracture_energy"]) / (BAND_CELLS * dx)
+    numbers = (torch.tensor([v], dtype=torch.float64) for v in (kappa, young, tensile, energy))
+    found, xi, alpha0, _ = opening(*numbers)
+    columns = {
+        "c2": slope, "c3": float(found), "c4": float(xi), "c5": -max(compressive / tensile, 1.0),
+    }  # fmt: skip
+    return columns, float(alpha0)
+
+
 def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Laws int32 [M], parameters float64 [M, 8] and alpha at the start [N] of a scene.
 
     Args:
         scene: The scene.
-        law: Of what breaks: ``nacc`` or ``phase_field``.
+        law: Of what breaks: ``nacc``, ``rankine`` or ``phase_field``.
     """
     laws, params, alpha = [], [], []
     for m in scene.materials:
@@ -67,12 +92,15 @@ def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, t
             if nacc
             else {}
         )  # fmt: skip
+        first = float(m.get("alpha", 0.0)) if nacc else 0.0
+        if nacc and law == "rankine":
+            columns, first = _rankine(m, scene.dx)
         params.append(
             parameters(
                 float(m["young_modulus"]), float(m["poisson_ratio"]), float(m["density"]), **columns
             )
         )
-        alpha.append(float(m.get("alpha", 0.0)) if nacc else 0.0)
+        alpha.append(first)
     start = torch.tensor(alpha, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
     return torch.tensor(laws, dtype=torch.int32), torch.stack(params), start
 
@@ -85,7 +113,7 @@ def viscosity(scene: Scene, law: str = "nacc") -> torch.Tensor | None:
         law: Of what breaks; ``phase_field`` has no yield.
     """
     time = [float(m.get("yield_time", 0.0)) for m in scene.materials]
-    if law != "nacc" or not any(time):
+    if law == "phase_field" or not any(time):
         return None
     found = torch.zeros((scene.count, 9), dtype=torch.float64)
     found[:, 8] = torch.tensor(time, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
@@ -159,7 +187,7 @@ def run_case(
         place: How far the points lie off their place on the grid [dx], along the axes that no
             collider looks along: a wall has to stay on its nodes. What is handed in does not move.
         method: Name in the record.
-        law: Of what breaks, ``nacc`` or ``phase_field``.
+        law: Of what breaks, ``nacc``, ``rankine`` or ``phase_field``.
         contact: What separating colliders and other bodies push: ``nodes`` or ``points``.
         watch: ``watch(world, i)`` is called at time ``i`` of the scene, outside the measured time.
         setup: ``setup(world)`` is called once before the first step; it may wrap ``world.force``.
