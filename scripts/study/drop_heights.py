@@ -538,7 +538,8 @@ def main(arguments: list[str] | None = None) -> int:
         (name, how)
         for how in options.stiffness
         for name in options.only or heights
-        if (name, breaks_by(heights[name]), how, options.quick) not in done and not options.only_table
+        if not options.only_table
+        and (name, breaks_by(heights[name]), how, options.quick) not in done
         and heights[name].get("stiffness", how) == how
         and (how == "preset" or materials.get(heights[name]["preset"]).softening > 1.0)
     ]  # fmt: skip

@@ -53,8 +53,10 @@ class Account:
     Hand it to a simulation as its ``step_hook``.
 
     Attributes:
-        torn: Plastic work of each point while all of its stress pulls [J], float64 [N].
-        pressed: The same under pressure.
+        torn: Plastic work of each point while all of its stress pulls [J], float64 [N]; by
+            Rankine's surface that of opening until it is broken, whatever presses beside it.
+        pressed: All other plastic work: under pressure; by Rankine's surface of sliding and of
+            what is broken.
         relaxed: What the spring of each point lost [J].
     """
 
@@ -70,6 +72,7 @@ class Account:
         self._elastic = torch.full_like(matter.law, LAWS["elastic"])
         self._plain = torch.zeros_like(matter.params)
         self._plain[:, :2] = matter.params[:, :2]
+        self._cut_off = matter.params[matter.particles.material.long(), 5] < 0.0
         self._last = state
         self._held, self._stress = self._energies(state), self._shared(self._stresses(state), state)
 
@@ -95,8 +98,15 @@ class Account:
         yielded, faded = self._yielding(self._last, state, rate=c * dt, law=raw[0], dt=dt)
         let_go = torch.where(yielded, lost - faded, 0.0)
         tension = (self._stress[0] + self._stress[1])[:, :3].sum(dim=1) > 0.0
-        self.torn += torch.where(tension, plastic + let_go, 0.0)
-        self.pressed += torch.where(tension, 0.0, plastic + let_go)
+        torn = torch.where(tension, plastic + let_go, 0.0)
+        if bool(self._cut_off.any()):
+            was = self._last.particles.alpha
+            grown = (after.alpha > was) & (was < 0.0)
+            opened = self._strength_left(self._last) - self._strength_left(state)
+            opened += torch.where(grown, let_go, 0.0)
+            torn = torch.where(self._cut_off, opened, torn)
+        self.torn += torn
+        self.pressed += plastic + let_go - torn
         self.relaxed += lost - let_go
         self._last, self._held, self._stress = state, held, stress
         return state
@@ -112,6 +122,15 @@ class Account:
         )
         volume = p.volume.double()
         return volume * ((1.0 - share) * law).double(), volume * (share * held).double()
+
+    def _strength_left(self, state: State) -> Tensor:
+        """What Rankine's surface takes yet until nothing is left [J], float64 [N]."""
+        assert self.matter is not None
+        p = state.particles
+        row = self.matter.params[p.material.long()].double()
+        size = row[:, 3] * row[:, 1] / row[:, 4].clamp(min=1e-30)
+        left = torch.cosh(row[:, 4] * (-p.alpha.double()).clamp(min=0.0)) - 1.0
+        return (1.0 - self._shares(state)[0].double()) * p.volume.double() * size * left
 
     def _shares(self, state: State) -> tuple[Tensor, Tensor]:
         """Share of the stiffness that relaxes [N], strain of its spring [N, 6]."""
@@ -285,7 +304,8 @@ def paths_table(laws: Sequence[str], steps: int = 4000) -> str:
         )  # fmt: skip
         found = [energy_of_path(row, alpha, way, steps) for way in ways]
         target = float(preset.fracture_energy or 0.0) / (BAND_CELLS * dx)
-        out.append([name, law_of(preset), f"{nu:g}", *(f"{energy / target:.2f}" for energy in found)])
+        ratios = (f"{energy / target:.2f}" for energy in found)
+        out.append([name, law_of(preset), f"{nu:g}", *ratios])
     return table(head, out)
 
 

@@ -103,10 +103,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     keys = ("object", "law", "stiffness", "cells")
     done = {tuple(r[k] for k in keys) for r in records(options.output)}
+    breaks_by = {
+        name: law_of(preset_of(literature[name]["preset"], options.law)) for name in options.only
+    }
     wanted = [
         (name, how, cells) for cells in options.cells for how in STIFFNESS for name in options.only
-        if (name, law_of(preset_of(literature[name]["preset"], options.law)), how, cells) not in done
-        and not options.only_table
+        if (name, breaks_by[name], how, cells) not in done and not options.only_table
     ]  # fmt: skip
     options.output.parent.mkdir(parents=True, exist_ok=True)
     for name, how, cells in wanted:

@@ -36,9 +36,7 @@ def fracture_energy(length: float) -> float:
     return length * TENSILE**2 / YOUNG
 
 
-def stone(
-    length: float, compressive: float = COMPRESSIVE, surface: str = "cam_clay"
-) -> Material:
+def stone(length: float, compressive: float = COMPRESSIVE, surface: str = "cam_clay") -> Material:
     """A brittle material of which ``E G_c / s^2``, s its tensile strength, is a length [m].
 
     Args:
