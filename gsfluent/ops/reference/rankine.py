@@ -61,7 +61,8 @@ def _slide(d: Tensor, j2m1: Tensor, alpha: Tensor, m: Material) -> tuple[Tensor,
     )
     most = most.clamp(min=0.0)
     slides = q > most * (1.0 + slack)
-    return torch.where(slides[:, None], (most / q)[:, None] * d, d), slides
+    share = torch.where(slides, most, 1.0) / torch.where(slides, q, 1.0)
+    return share[:, None] * d, slides
 
 
 def _open(
