@@ -143,7 +143,7 @@ def compact(dx: float, length: float, split: str, device: str) -> tuple[dict[str
     points = cracks.plate(np.zeros(2), np.array([wide, high]), dx, 8)
     x, y = points[:, 0], np.abs(points[:, 1])
     points = points[~((x < deep) & (y < 0.5 * gap)) & ~((x < tip) & (y < 1.51 * dx))]
-    breakable = points[:, 0] > 0.1 * wide  # not where the bar meets it
+    breakable = points[:, 0] > deep  # not the arms: what the bar sends breaks them, if l is wide
     scene = free(
         "compact", points, [0.0] * 3, dx, 8, np.linspace(0.0, 160e-6, 41)[1:],
         (elastic(*PMMA), row), material=breakable,
