@@ -163,6 +163,42 @@ GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m,
   return {active, add_diagonal(stress, lambda * (g * open + pressed))};
 }
 
+// The product of two matrices that commute.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> commuting_product(const Sym3<T>& a, const Sym3<T>& b) {
+  return {a.xx * b.xx + a.xy * b.xy + a.xz * b.xz, a.xy * b.xy + a.yy * b.yy + a.yz * b.yz,
+          a.xz * b.xz + a.yz * b.yz + a.zz * b.zz, a.xx * b.xy + a.xy * b.yy + a.xz * b.yz,
+          a.xx * b.xz + a.xy * b.yz + a.xz * b.zz, a.xy * b.xz + a.yy * b.yz + a.yz * b.zz};
+}
+
+// What phase_state_spectral gives where nothing is damaged, without principal strains, and the most
+// that may drive (by kSplitRankine where rankine is 1, else 0). For numbers and for packs of them;
+// |e|^2 up to kWholeStrain2. log(I + e) / 2 is the series of atanh(z), z = e / (2 + e).
+inline constexpr double kWholeStrain2 = 0.09;
+template <typename T>
+GSF_HOST_DEVICE PhaseState<T> phase_state_whole(T mu, T kappa, T rankine, const Sym3<T>& e) {
+  using std::sqrt;
+  const Sym3<T> b = add_diagonal(e, T(2));
+  const Sym3<T> adjugate = {b.yy * b.zz - b.yz * b.yz, b.xx * b.zz - b.xz * b.xz,
+                            b.xx * b.yy - b.xy * b.xy, b.xz * b.yz - b.xy * b.zz,
+                            b.xy * b.yz - b.xz * b.yy, b.xy * b.xz - b.xx * b.yz};
+  const T inverse = T(1) / (b.xx * adjugate.xx + b.xy * adjugate.xy + b.xz * adjugate.xz);
+  const Sym3<T> z = commuting_product(e, inverse * adjugate), z2 = square(z);
+  constexpr int kTerms = 19;  // |z| is at most 0.18
+  Sym3<T> sum = add_diagonal(Sym3<T>{}, T(1.0 / double(kTerms)));
+  for (int n = kTerms - 2; n >= 1; n -= 2)
+    sum = add_diagonal(commuting_product(z2, sum), T(1.0 / double(n)));
+  const Sym3<T> h = commuting_product(z, sum);
+  const T log_j = h.xx + h.yy + h.zz, squares = norm2(h);
+  const T lambda = kappa - T(2.0 / 3.0) * mu, young = T(9) * kappa * mu / (T(3) * kappa + mu);
+  const T away = max(squares - T(1.0 / 3.0) * log_j * log_j, T(0));
+  const T largest = T(1.0 / 3.0) * log_j + T(0.816496580927727) * sqrt(away);
+  const T pull = max(lambda * log_j + T(2) * mu * largest, T(0)), open = max(log_j, T(0));
+  return {rankine * (T(0.5) * pull * pull / young) +
+              (T(1) - rankine) * (mu * squares + T(0.5) * lambda * open * open),
+          add_diagonal(T(2) * mu * h, lambda * log_j)};
+}
+
 template <typename T>
 GSF_HOST_DEVICE T alpha_after(const MaterialRow<T>& m, T alpha, T active) {
   const T drive = m.strength > T(0) ? active / m.strength : T(0);

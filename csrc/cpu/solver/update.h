@@ -106,8 +106,9 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   [[maybe_unused]] P alpha_after(0), peak_after(0);
   P loss(0);
   Int phase{};
-  [[maybe_unused]] Int forgets{};  // broken, and beyond what it remembers
-  P damage(0), history(0), all(0);
+  [[maybe_unused]] Int forgets{};    // broken, and beyond what it remembers
+  [[maybe_unused]] Int principal{};  // whole, of a split by principal strains
+  P damage(0), history(0), all(0), rankine(0);
   if constexpr (kLaws == kDamageField) {
     phase =
         -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kPhaseField)); });
@@ -131,8 +132,11 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         mix(forgets, e,
             add_diagonal(stretch * d, (stretch - P(1)) + stretch * unit_det_shift_small(d)));
       }
-      plain &= ~phase | ((split < P(1.5)) & (n2 <= P(0.25)) & (j2m1 < P(kSeriesOpen)) &
-                         (j2m1 > P(kSeriesPressed)));
+      principal = phase & (split > P(1.5)) & (damage <= P(0)) & (norm2(e) <= P(kWholeStrain2));
+      rankine = select<T>(split > P(2.5), P(1), P(0));
+      plain &= ~phase | principal |
+               ((split < P(1.5)) & (n2 <= P(0.25)) & (j2m1 < P(kSeriesOpen)) &
+                (j2m1 > P(kSeriesPressed)));
       all = select<T>(split > P(0.5), P(1), P(0));
       whole = ~phase | (peak < P(0));
       loss = select<T>(phase, row[7], P(0));
@@ -191,7 +195,14 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const PhaseState<P> now = phase_state(row[0], row[1], damage, all, d, unit_det_shift_small(d),
                                             j2m1, [](P x) { return volume_series(x); });
       mix(phase, stress, now.stress);
+      const P before = history;
       history = max(history, min(now.active / row[2], P(kDriveMax)) - P(1));
+      if (mask_bits(principal) != 0) {
+        const PhaseState<P> intact = phase_state_whole(row[0], row[1], rankine, e);
+        mix(principal, stress, intact.stress);
+        history = select<T>(principal, before, history);
+        plain &= ~principal | (intact.active <= (before + P(1)) * row[2]);
+      }
     }
   }
   [[maybe_unused]] Sym3<P> spring;
