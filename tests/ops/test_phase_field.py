@@ -418,8 +418,11 @@ def test_what_is_no_field_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("model", "split", "more"),
-    [("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False)],
-)
+    [
+        ("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False),
+        ("at1", "rankine", False),
+    ],
+)  # fmt: skip
 def test_the_resident_solver_does_what_the_composed_operators_do(
     model: str, split: str, more: bool
 ) -> None:
