@@ -12,9 +12,10 @@ from phase_scenes import DX, assert_kept, plates, row, stepped
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.materials.phase_field import GRID_ENERGY, MODELS, SPLITS
+from gsfluent.materials.phase_field import C0, GRID_ENERGY, MODELS, SPLITS
+from gsfluent.ops.collider import collider_row
 from gsfluent.ops.damage import solve_drive
-from gsfluent.ops.plasticity import LAWS
+from gsfluent.ops.plasticity import LAWS, weakened
 from gsfluent.ops.reference import damage as dense
 from gsfluent.ops.reference import phase_field as reference
 from gsfluent.ops.reference import plasticity
@@ -417,8 +418,11 @@ def test_what_is_no_field_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("model", "split", "more"),
-    [("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False)],
-)
+    [
+        ("at1", "none", False), ("at1", "volumetric", True), ("at2", "spectral", False),
+        ("at1", "rankine", False),
+    ],
+)  # fmt: skip
 def test_the_resident_solver_does_what_the_composed_operators_do(
     model: str, split: str, more: bool
 ) -> None:
@@ -463,6 +467,46 @@ def test_the_resident_solver_has_the_same_bits_in_any_order_and_threads() -> Non
 
 def test_a_break_keeps_momentum_and_makes_no_energy() -> None:
     assert_kept(plates(torch.float32, split="volumetric"))
+
+
+@pytest.mark.parametrize("model", list(MODELS))
+def test_a_bar_that_is_stretched_slowly_bears_its_strength(model: str) -> None:
+    """AT1: sqrt(3 E Gc / (8 l)), AT2: (9/16) sqrt(E Gc / (3 l)), of the solver's Gc; l is 4 dx."""
+    position, volume = bar(40)  # what is held is whole, and keeps what is near it so
+    young, psi, length = 1e5, 1.0, 4.0 * DX
+    rows = row(0.0, "none", model, psi)
+    rows[0, :2] = torch.tensor([0.5 * young, young / 3.0])  # nothing gives way across
+    rows[0, 4], rows[0, 7] = length, 0.0
+    count, long = len(position), float(position[:, 0].max())
+    rate = math.sqrt(2.0 * psi / young) / 0.25  # six waves through the bar until it breaks
+    velocity = torch.zeros(count, 3, dtype=torch.float64)
+    velocity[:, 0] = rate * (position[:, 0] - 0.5 * long)
+    grips = [
+        collider_row(
+            "box", point=(x, 0.0, 0.0), extent=(1.5 * DX, 1.0, 1.0), mode="sticky",
+            velocity=(rate * (x - 0.5 * long), 0.0, 0.0),
+        )
+        for x in (0.0, long)
+    ]  # fmt: skip
+    solver = ops.Solver(
+        position, velocity, 1000.0 * volume, volume, dx=DX, dt=3e-4, law=LAW, params=rows,
+        alpha=torch.full_like(volume, -1.0), gravity=(0.0, 0.0, 0.0),
+        colliders=torch.stack(grips).double(),
+    )  # fmt: skip
+    middle = (position[:, 0] - 0.5 * long).abs() < 2.0 * DX
+    most = 0.0
+    for _ in range(50):
+        solver.advance(steps=30)
+        law, params = weakened(LAW, rows, torch.zeros(count, dtype=torch.int32), solver.peak)
+        stress = ops.return_mapping(
+            solver.strain, solver.alpha, still(count), law=law, params=params
+        )[2]
+        most = max(most, float(stress[middle, 0].mean()))
+    assert float(solver.peak.max()) > 0.0
+    gc = 2.0 * C0[model] * length * psi
+    strength = {"at1": (3.0 * young * gc / (8.0 * length)) ** 0.5,
+                "at2": 9.0 / 16.0 * (young * gc / (3.0 * length)) ** 0.5}  # fmt: skip
+    assert most == pytest.approx(strength[model], rel=0.02)
 
 
 @pytest.mark.parametrize(("sign", "share"), [(-1.0, 1.0), (1.0, reference.RESIDUAL)])

@@ -120,47 +120,100 @@ GSF_HOST_DEVICE PhaseState<T> phase_state(T mu, T kappa, T damage, T all, const 
           add_diagonal(g * mu * d, T(0.5) * kappa * (g * counted + (T(1) - all) * pressed))};
 }
 
-// Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2. kSplitRankine
-// has <largest principal stress over g>^2 / 2E in the place of psi+ as what drives.
+// What phase_state_spectral takes of a number; of packs of them cpu/solver/principal.h.
 template <typename T>
-GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m, const Sym3<T>& e) {
-  using std::log1p;
-  const Vec3<T> found = eigenvalues_jacobi(e);
+struct PrincipalOfNumber {
+  GSF_HOST_DEVICE Vec3<T> eigenvalues(const Sym3<T>& e) const { return eigenvalues_jacobi(e); }
+  GSF_HOST_DEVICE T half_log(T x) const {  // ln(1 + x) / 2
+    using std::log1p;
+    return T(0.5) * log1p(x);
+  }
+  GSF_HOST_DEVICE T log_over(T y) const { return log1p_over(y); }
+  GSF_HOST_DEVICE T pick(bool which, T yes, T no) const { return which ? yes : no; }
+};
+
+// Split by the principal Hencky strains h: psi+ = mu sum <h_i>^2 + lambda/2 <tr h>^2. kSplitRankine
+// (rankine 1, else 0) has <largest principal stress over g>^2 / 2E in the place of psi+ as what
+// drives.
+template <typename T, typename Of>
+GSF_HOST_DEVICE PhaseState<T> phase_state_spectral(T mu, T kappa, T damage, T rankine,
+                                                   const Sym3<T>& e, const Of& of) {
+  const Vec3<T> found = of.eigenvalues(e);
   const T least = T(kEigenvalueMin - 1.0);
   const T x[3] = {max(found.x, least), max(found.y, least), max(found.z, least)};
   T h[3], up[3], all[2], tension[2];
   for (int i = 0; i < 3; ++i) {
-    h[i] = T(0.5) * log1p(x[i]);
+    h[i] = of.half_log(x[i]);
     up[i] = max(h[i], T(0));
   }
   for (int i = 0; i < 2; ++i) {  // divided differences of h and of <h>, largest eigenvalue first
     const T apart = x[i] - x[i + 1], b = T(1) + x[i + 1];
-    all[i] = T(0.5) * log1p_over(apart / b) / b;
-    tension[i] = h[i + 1] >= T(0) ? all[i] : (apart > T(0) ? up[i] / apart : T(0));
+    all[i] = T(0.5) * of.log_over(apart / b) / b;
+    tension[i] = of.pick(h[i + 1] >= T(0), all[i], of.pick(apart > T(0), up[i] / apart, T(0)));
   }
   const T span = x[0] - x[2];
   // Below it the second differences overflow, and what they multiply is nothing.
-  const bool apart = span > T(1e-30);
-  const T all2 = apart ? (all[0] - all[1]) / span : T(0);
-  const T tension2 = apart ? (tension[0] - tension[1]) / span : T(0);
+  const T all2 = of.pick(span > T(1e-30), (all[0] - all[1]) / span, T(0));
+  const T tension2 = of.pick(span > T(1e-30), (tension[0] - tension[1]) / span, T(0));
   // Newton's polynomial f1 + f12 (e - x1) + f123 (e - x1)(e - x2).
-  const Sym3<T> first = add_diagonal(e, -x[0]);
+  const Sym3<T> first = add_diagonal(e, T(0) - x[0]);
   const Sym3<T> second = square(first) + (x[0] - x[1]) * first;
   const Sym3<T> log_v = add_diagonal(all[0] * first + all2 * second, h[0]);
   const Sym3<T> plus = add_diagonal(tension[0] * first + tension2 * second, up[0]);
-  const T whole = T(1) - m.cohesion;
+  const T whole = T(1) - damage;
   const T g = T(1.0 - kResidualStiffness) * whole * whole + T(kResidualStiffness);
-  const T lambda = m.kappa - T(2.0 / 3.0) * m.mu;
+  const T lambda = kappa - T(2.0 / 3.0) * mu;
   const T log_j = h[0] + h[1] + h[2], open = max(log_j, T(0)), pressed = min(log_j, T(0));
-  const Sym3<T> stress = T(2) * m.mu * ((g - T(1)) * plus + log_v);
+  const Sym3<T> stress = T(2) * mu * ((g - T(1)) * plus + log_v);
   // What damaged matter bears, over g: pressed along one axis it widens across until nothing pulls
   // there, and that must not drive it on.
-  const T pull = max(lambda * (open + pressed / g) + T(2) * m.mu * h[0], T(0));
-  const T young = T(9) * m.kappa * m.mu / (T(3) * m.kappa + m.mu);
+  const T pull = max(lambda * (open + pressed / g) + T(2) * mu * h[0], T(0));
+  const T young = T(9) * kappa * mu / (T(3) * kappa + mu);
   const T squares = up[0] * up[0] + up[1] * up[1] + up[2] * up[2];
-  const T active = split_of(m) == kSplitRankine ? T(0.5) * pull * pull / young
-                                                : m.mu * squares + T(0.5) * lambda * open * open;
+  const T active = rankine * (T(0.5) * pull * pull / young) +
+                   (T(1) - rankine) * (mu * squares + T(0.5) * lambda * open * open);
   return {active, add_diagonal(stress, lambda * (g * open + pressed))};
+}
+template <typename T>
+GSF_HOST_DEVICE_COLD PhaseState<T> phase_state_spectral(const MaterialRow<T>& m, const Sym3<T>& e) {
+  const T rankine = split_of(m) == kSplitRankine ? T(1) : T(0);
+  return phase_state_spectral(m.mu, m.kappa, m.cohesion, rankine, e, PrincipalOfNumber<T>{});
+}
+
+// The product of two matrices that commute.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> commuting_product(const Sym3<T>& a, const Sym3<T>& b) {
+  return {a.xx * b.xx + a.xy * b.xy + a.xz * b.xz, a.xy * b.xy + a.yy * b.yy + a.yz * b.yz,
+          a.xz * b.xz + a.yz * b.yz + a.zz * b.zz, a.xx * b.xy + a.xy * b.yy + a.xz * b.yz,
+          a.xx * b.xz + a.xy * b.yz + a.xz * b.zz, a.xy * b.xz + a.yy * b.yz + a.yz * b.zz};
+}
+
+// What phase_state_spectral gives where nothing is damaged, without principal strains, and the most
+// that may drive (by kSplitRankine where rankine is 1, else 0). For numbers and for packs of them;
+// |e|^2 up to kWholeStrain2. log(I + e) / 2 is the series of atanh(z), z = e / (2 + e).
+inline constexpr double kWholeStrain2 = 0.09;
+template <typename T>
+GSF_HOST_DEVICE PhaseState<T> phase_state_whole(T mu, T kappa, T rankine, const Sym3<T>& e) {
+  using std::sqrt;
+  const Sym3<T> b = add_diagonal(e, T(2));
+  const Sym3<T> adjugate = {b.yy * b.zz - b.yz * b.yz, b.xx * b.zz - b.xz * b.xz,
+                            b.xx * b.yy - b.xy * b.xy, b.xz * b.yz - b.xy * b.zz,
+                            b.xy * b.yz - b.xz * b.yy, b.xy * b.xz - b.xx * b.yz};
+  const T inverse = T(1) / (b.xx * adjugate.xx + b.xy * adjugate.xy + b.xz * adjugate.xz);
+  const Sym3<T> z = commuting_product(e, inverse * adjugate), z2 = square(z);
+  constexpr int kTerms = 19;  // |z| is at most 0.18
+  Sym3<T> sum = add_diagonal(Sym3<T>{}, T(1.0 / double(kTerms)));
+  for (int n = kTerms - 2; n >= 1; n -= 2)
+    sum = add_diagonal(commuting_product(z2, sum), T(1.0 / double(n)));
+  const Sym3<T> h = commuting_product(z, sum);
+  const T log_j = h.xx + h.yy + h.zz, squares = norm2(h);
+  const T lambda = kappa - T(2.0 / 3.0) * mu, young = T(9) * kappa * mu / (T(3) * kappa + mu);
+  const T away = max(squares - T(1.0 / 3.0) * log_j * log_j, T(0));
+  const T largest = T(1.0 / 3.0) * log_j + T(0.816496580927727) * sqrt(away);
+  const T pull = max(lambda * log_j + T(2) * mu * largest, T(0)), open = max(log_j, T(0));
+  return {rankine * (T(0.5) * pull * pull / young) +
+              (T(1) - rankine) * (mu * squares + T(0.5) * lambda * open * open),
+          add_diagonal(T(2) * mu * h, lambda * log_j)};
 }
 
 template <typename T>

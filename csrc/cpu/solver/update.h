@@ -6,6 +6,7 @@
 #include "core/material/nacc_softened.h"
 #include "core/material/rankine.h"
 #include "cpu/solver/packet.h"
+#include "cpu/solver/principal.h"
 
 namespace gsf::cpu {
 
@@ -116,8 +117,9 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
   [[maybe_unused]] P alpha_after(0), peak_after(0);
   P loss(0);
   Int phase{};
-  [[maybe_unused]] Int forgets{};  // broken, and beyond what it remembers
-  P damage(0), history(0), all(0);
+  [[maybe_unused]] Int forgets{};    // broken, and beyond what it remembers
+  [[maybe_unused]] Int principal{};  // of a split by principal strains
+  P damage(0), history(0), all(0), rankine(0);
   if constexpr (kLaws == kDamageField) {
     phase =
         -int_pack_of<T>([&](int lane) { return Word(s.law[row_of(lane)] == int(kPhaseField)); });
@@ -141,8 +143,12 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         mix(forgets, e,
             add_diagonal(stretch * d, (stretch - P(1)) + stretch * unit_det_shift_small(d)));
       }
-      plain &= ~phase | ((split < P(1.5)) & (n2 <= P(0.25)) & (j2m1 < P(kSeriesOpen)) &
-                         (j2m1 > P(kSeriesPressed)));
+      principal = phase & (split > P(1.5)) & (norm2(e) <= P(kPrincipalStrain2)) &
+                  ~(broken & (j2m1 >= P(kBrokenVolumeMax)));
+      rankine = select<T>(split > P(2.5), P(1), P(0));
+      plain &= ~phase | principal |
+               ((split < P(1.5)) & (n2 <= P(0.25)) & (j2m1 < P(kSeriesOpen)) &
+                (j2m1 > P(kSeriesPressed)));
       all = select<T>(split > P(0.5), P(1), P(0));
       whole = ~phase | (peak < P(0));
       loss = select<T>(phase, row[7], P(0));
@@ -201,7 +207,23 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
       const PhaseState<P> now = phase_state(row[0], row[1], damage, all, d, unit_det_shift_small(d),
                                             j2m1, [](P x) { return volume_series(x); });
       mix(phase, stress, now.stress);
+      const P before = history;
       history = max(history, min(now.active / row[2], P(kDriveMax)) - P(1));
+      if (mask_bits(principal) != 0) {
+        history = select<T>(principal, before, history);
+        Int known = principal & (damage <= P(0)) & (norm2(e) <= P(kWholeStrain2));
+        const PhaseState<P> intact = phase_state_whole(row[0], row[1], rankine, e);
+        known &= intact.active <= (before + P(1)) * row[2];
+        mix(known, stress, intact.stress);
+        const Int rest = principal & ~known;
+        if (mask_bits(rest) != 0) {
+          const PhaseState<P> split =
+              phase_state_spectral(row[0], row[1], damage, rankine, e, PrincipalOfPack<T>{});
+          mix(rest, stress, split.stress);
+          const P now = max(before, min(split.active / row[2], P(kDriveMax)) - P(1));
+          history = select<T>(rest, now, history);
+        }
+      }
     }
   }
   [[maybe_unused]] Sym3<P> spring;

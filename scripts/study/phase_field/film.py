@@ -97,7 +97,7 @@ class Fall:
 
 FALLS = {
     "pane": Fall("glass", 2.8e7, 300.0, 6.3, 4.0),
-    "bowl": Fall("ceramic", 3e7, 300.0, 6.0, 4.0),
+    "bowl": Fall("ceramic", 3e7, 300.0, 5.0, 4.0),
 }
 
 
@@ -159,10 +159,11 @@ def draw(axis: Any, place: np.ndarray, piece: np.ndarray, name: str) -> None:
     from matplotlib import colormaps
 
     order = np.argsort(place[:, 2])
-    shade = np.random.default_rng(1).permutation(20)
-    color = np.where(piece >= 0, shade[np.maximum(piece, 0) % 20], -1)
+    colors = [c for c in colormaps["tab20"].colors if max(c) - min(c) > 0.05]  # no greys
+    shade = np.random.default_rng(1).permutation(len(colors))
+    color = np.where(piece >= 0, shade[np.maximum(piece, 0) % len(colors)], -1)
     axis.set_facecolor("#1c1c20")
-    tints = np.array([(0.54, 0.54, 0.54), *colormaps["tab20"].colors])
+    tints = np.array([(0.54, 0.54, 0.54), *colors])
     axis.scatter(place[order, 0], place[order, 1], s=3.0, lw=0, c=tints[color[order] + 1])
     axis.set_title(name, fontsize=9)
     axis.set_xticks([])

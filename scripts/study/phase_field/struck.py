@@ -126,7 +126,7 @@ def kalthoff(
     return found | _direction(scene, run, np.array([tip, height])), scene, run
 
 
-def compact(dx: float, length: float, device: str) -> tuple[dict[str, Any], Scene, Run]:
+def compact(dx: float, length: float, split: str, device: str) -> tuple[dict[str, Any], Scene, Run]:
     """A compact compression specimen struck on one arm, after Rittel and Maigre 1996.
 
     PMMA, 70 x 60 mm; a slot of 22 mm by 20 mm from the left edge, a notch of 12 mm on from its
@@ -135,14 +135,15 @@ def compact(dx: float, length: float, device: str) -> tuple[dict[str, Any], Scen
     Args:
         dx: Node spacing [m].
         length: Of the phase field [m].
+        split: ``rankine``, or ``spectral``, by which the struck arm is crushed.
         device: Where.
     """
     wide, high, deep, gap, tip = 0.07, 0.06, 0.022, 0.02, 0.034
-    row = cracks.griffith(*PMMA, toughness=PMMA_TOUGHNESS, length=length, dx=dx, split="spectral")
+    row = cracks.griffith(*PMMA, toughness=PMMA_TOUGHNESS, length=length, dx=dx, split=split)
     points = cracks.plate(np.zeros(2), np.array([wide, high]), dx, 8)
     x, y = points[:, 0], np.abs(points[:, 1])
     points = points[~((x < deep) & (y < 0.5 * gap)) & ~((x < tip) & (y < 1.51 * dx))]
-    breakable = points[:, 0] > 0.1 * wide  # not where the bar meets it
+    breakable = points[:, 0] > deep  # not the arms: what the bar sends breaks them, if l is wide
     scene = free(
         "compact", points, [0.0] * 3, dx, 8, np.linspace(0.0, 160e-6, 41)[1:],
         (elastic(*PMMA), row), material=breakable,
@@ -154,8 +155,10 @@ def compact(dx: float, length: float, device: str) -> tuple[dict[str, Any], Scen
         "box", point=(0.25 * dx - half[0], -0.5 * (high - arm), 0.0), extent=half, mode="separate"
     )
     run = struck(scene, bar, 20.0, device)
-    found = {"length_mm": 1e3 * length} | _direction(scene, run, np.array([tip, 0.0]), -1.0)
-    return found, scene, run
+    sides = {s: _direction(scene, run, np.array([tip, 0.0]), s) for s in (1.0, -1.0)}
+    side = max(sides, key=lambda s: sides[s]["length"])
+    found = {"split": split, "length_mm": 1e3 * length, "towards_load": side < 0.0}
+    return found | sides[side], scene, run
 
 
 def apart(line: Floats, other: Floats) -> float:

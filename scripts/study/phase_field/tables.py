@@ -173,7 +173,7 @@ def kalthoff(found: Sequence[Found]) -> str:
 
 def bending(found: Sequence[Found], own: Sequence[Found]) -> str:
     """Largest force of the beam beside that of finite elements."""
-    best = max(own, key=lambda f: int(f["points"]), default=None)
+    best = max(own, key=lambda f: (f["blunt"], int(f["points"])), default=None)
     force, way = (None, None) if best is None else (best["force"], best["moved"])
     return peak([*own, *found], force, way)
 
