@@ -175,16 +175,18 @@ class TouchPlan {
       const int32_t own = s_.object[s_.slot_coord[4 * slot + 3]];
       place(site_[slot]);
       const int32_t* around = around_.data() + kNeighbours * int64_t(site_[slot]);
-      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1)
+      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1) {
+        const int local = __builtin_ctzll(left);
         for (int o = 0; o < kNeighbours; ++o) {
-          int there;
-          const int32_t site = around[near_block(__builtin_ctzll(left), o, there)];
+          const int there = kNear.at[local][o];
+          const int32_t site = around[kNear.block[local][o]];
           if (site < 0) continue;
           const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
           for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
             if (s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] != own)
               near_[slots[f]] |= uint64_t(1) << there;
         }
+      }
     }
   }
 
@@ -251,8 +253,8 @@ class TouchPlan {
     const int32_t own = s_.object[s_.slot_coord[4 * int64_t(cell.slot) + 3]];
     const int32_t* around = around_.data() + kNeighbours * int64_t(site_[cell.slot]);
     for (int o = 0; o < kNeighbours; ++o) {
-      int there;
-      const int32_t site = around[near_block(cell.local, o, there)];
+      const int there = kNear.at[cell.local][o];
+      const int32_t site = around[kNear.block[cell.local][o]];
       if (site < 0) continue;
       const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
       for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) {

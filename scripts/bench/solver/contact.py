@@ -4,9 +4,9 @@
     python scripts/bench/solver/contact.py --device cuda --cells 24 50 80 --json g.jsonl
     python scripts/bench/solver/contact.py --table g.jsonl --markdown docs/measured/solver.md
 
-Cost: a cube of so many cells, eight points in each, falls onto a floor that its lowest layer touches;
-as one body, and as two that touch over a whole face. That is more contact than a shot has. On a CPU
-the time is that of the process, one thread; on a GPU that of events.
+Cost: a cube of so many cells, eight points in each, falls onto a floor that its lowest layer
+touches; as one body, and as two that touch over a whole face. That is more contact than a shot has.
+On a CPU the time is that of the process, one thread; on a GPU that of events.
 
 Depth: an elastic ball of five cells a radius lands on a floor at a share of its wave speed. How far
 its lowest point gets below the floor, and which share of its speed it keeps. Always on a CPU.
@@ -177,11 +177,11 @@ def main() -> int:
     options = parser.parse_args()
     if options.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
+    torch.set_num_threads(1)
     if options.table is not None:
         rows = [row for path in options.table for row in path.read_text().splitlines()]
         lines = [Line(**json.loads(row)) for row in rows]
     else:
-        torch.set_num_threads(1)
         each = [measure(cells, options.device, options.repeats) for cells in options.cells]
         lines = [line for some in each for line in some]
     if options.json:
