@@ -168,7 +168,9 @@ def fracture_cases(records: Sequence[Record]) -> str:
         "|---|---|---|---|",
     ]
     ours = [r for r in records if r.method.startswith("gsfluent")]
-    seen = {r.case: r for r in sorted(ours, key=lambda r: r.method == "gsfluent")}  # by default last
+    seen = {
+        r.case: r for r in sorted(ours, key=lambda r: r.method == "gsfluent")
+    }  # by default last
     for case in cases("fracture"):
         if case.name not in seen:
             continue
