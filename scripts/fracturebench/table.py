@@ -167,7 +167,10 @@ def fracture_cases(records: Sequence[Record]) -> str:
         "| case | what happens | judged by (reference; tolerance) | source |",
         "|---|---|---|---|",
     ]
-    seen: dict[str, Record] = {r.case: r for r in records if r.method == "gsfluent"}
+    ours = [r for r in records if r.method.startswith("gsfluent")]
+    seen = {
+        r.case: r for r in sorted(ours, key=lambda r: r.method == "gsfluent")
+    }  # by default last
     for case in cases("fracture"):
         if case.name not in seen:
             continue

@@ -105,6 +105,20 @@ class TouchPlan {
     TouchMatter matter;
     double lag;
   };
+  // Points near a cell: their numbers and places, and room for what is computed of them.
+  struct Others {
+    std::vector<int32_t> item;
+    std::vector<double> x[3], r2;
+
+    void clear() {
+      item.clear();
+      for (auto& along : x) along.clear();
+    }
+    void add(int32_t i, const double* place) {
+      item.push_back(i);
+      for (int axis = 0; axis < 3; ++axis) x[axis].push_back(place[axis]);
+    }
+  };
   // Cell of a slot with such points.
   struct Cell {
     int32_t slot, local;
@@ -115,12 +129,12 @@ class TouchPlan {
     const auto each = [&](const auto& f) {
       parallel_for(static_cast<int64_t>(cells_.size()), kCellGrain,
                    [&](int64_t begin, int64_t end) {
-                     std::vector<int32_t> others;
-                     for (int64_t i = begin; i < end; ++i) f(cells_[i], others);
+                     Others others, deep;
+                     for (int64_t i = begin; i < end; ++i) f(cells_[i], others, deep);
                    });
     };
-    each([&](Cell& cell, std::vector<int32_t>& others) { find(cell, others); });
-    each([&](const Cell& cell, std::vector<int32_t>& others) { push(cell, others); });
+    each([&](Cell& cell, Others& others, Others&) { find(cell, others); });
+    each([&](const Cell& cell, Others& others, Others& deep) { push(cell, others, deep); });
     for (const Item& item : items_)
       if (item.pushed && item.home >= 0) homes_[item.home] = 1;
   }
@@ -161,16 +175,18 @@ class TouchPlan {
       const int32_t own = s_.object[s_.slot_coord[4 * slot + 3]];
       place(site_[slot]);
       const int32_t* around = around_.data() + kNeighbours * int64_t(site_[slot]);
-      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1)
+      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1) {
+        const int local = __builtin_ctzll(left);
         for (int o = 0; o < kNeighbours; ++o) {
-          int there;
-          const int32_t site = around[near_block(__builtin_ctzll(left), o, there)];
+          const int there = kNear.at[local][o];
+          const int32_t site = around[kNear.block[local][o]];
           if (site < 0) continue;
           const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
           for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
             if (s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] != own)
               near_[slots[f]] |= uint64_t(1) << there;
         }
+      }
     }
   }
 
@@ -232,37 +248,45 @@ class TouchPlan {
   }
 
   // Points of other objects in the 27 cells about one.
-  void gather(const Cell& cell, std::vector<int32_t>& others) const {
+  void gather(const Cell& cell, Others& others) const {
     others.clear();
     const int32_t own = s_.object[s_.slot_coord[4 * int64_t(cell.slot) + 3]];
     const int32_t* around = around_.data() + kNeighbours * int64_t(site_[cell.slot]);
     for (int o = 0; o < kNeighbours; ++o) {
-      int there;
-      const int32_t site = around[near_block(cell.local, o, there)];
+      const int there = kNear.at[cell.local][o];
+      const int32_t site = around[kNear.block[cell.local][o]];
       if (site < 0) continue;
       const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
       for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) {
         int32_t i = first_[int64_t(slots[f]) * kBlockNodes + there];
         if (i < 0 || s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] == own) continue;
-        for (; i >= 0; i = items_[i].next) others.push_back(i);
+        for (; i >= 0; i = items_[i].next) others.add(i, items_[i].x);
       }
     }
   }
 
+  // Distances first: few of them are short enough, and a loop without a choice is a fast one.
   template <typename F>
-  void each_near(const Item& p, const std::vector<int32_t>& others, const F& f) const {
-    for (const int32_t i : others) {
-      const Item& q = items_[i];
-      const double d[3] = {p.x[0] - q.x[0], p.x[1] - q.x[1], p.x[2] - q.x[2]};
-      const double r2 = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-      if (r2 < kTouchReach * kTouchReach) f(q, d, r2);
+  void each_near(const Item& p, Others& others, const F& f) const {
+    const size_t count = others.item.size();
+    const double *x = others.x[0].data(), *y = others.x[1].data(), *z = others.x[2].data();
+    others.r2.resize(count);
+    double* r2 = others.r2.data();
+    for (size_t i = 0; i < count; ++i) {
+      const double d[3] = {p.x[0] - x[i], p.x[1] - y[i], p.x[2] - z[i]};
+      r2[i] = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+    }
+    for (size_t i = 0; i < count; ++i) {
+      if (!(r2[i] < kTouchReach * kTouchReach)) continue;
+      const double d[3] = {p.x[0] - x[i], p.x[1] - y[i], p.x[2] - z[i]};
+      f(items_[others.item[i]], d, r2[i]);
     }
   }
 
   // How much of other bodies the points of a cell find.
-  void find(Cell& cell, std::vector<int32_t>& others) {
+  void find(Cell& cell, Others& others) {
     gather(cell, others);
-    cell.meets = !others.empty();
+    cell.meets = !others.item.empty();
     for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
          i = items_[i].next) {
       Item& p = items_[i];
@@ -276,16 +300,19 @@ class TouchPlan {
     }
   }
 
-  // What the points of a cell get.
-  void push(const Cell& cell, std::vector<int32_t>& others) {
+  // What the points of a cell get. Two that both find too little of each other's body push nothing.
+  void push(const Cell& cell, Others& others, Others& deep) {
     if (!cell.meets) return;
     gather(cell, others);
+    deep.clear();
+    for (const int32_t i : others.item)
+      if (items_[i].energy != 0.0) deep.add(i, items_[i].x);
     for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
          i = items_[i].next) {
       Item& p = items_[i];
       if (p.home < 0) continue;
       double sum[3] = {};
-      each_near(p, others, [&](const Item& q, const double* d, double r2) {
+      each_near(p, p.energy != 0.0 ? others : deep, [&](const Item& q, const double* d, double r2) {
         const double f = touch_force(p.energy, p.matter.volume, q.energy, q.matter.volume, r2);
         for (int axis = 0; axis < 3; ++axis) sum[axis] += f * d[axis];
       });

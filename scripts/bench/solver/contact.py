@@ -1,12 +1,15 @@
-"""What a step costs where nodes touch, and where points do: a block on a floor, and its halves.
+"""What a step costs where nodes touch, and where points do; how deep fast bodies sink by either.
 
     python scripts/bench/solver/contact.py --markdown docs/measured/solver.md
     python scripts/bench/solver/contact.py --device cuda --cells 24 50 80 --json g.jsonl
     python scripts/bench/solver/contact.py --table g.jsonl --markdown docs/measured/solver.md
 
-A cube of so many cells, eight points in each, slides down onto a floor that its lowest layer
+Cost: a cube of so many cells, eight points in each, falls onto a floor that its lowest layer
 touches; as one body, and as two that touch over a whole face. That is more contact than a shot has.
 On a CPU the time is that of the process, one thread; on a GPU that of events.
+
+Depth: an elastic ball of five cells a radius lands on a floor at a share of its wave speed. How far
+its lowest point gets below the floor, and which share of its speed it keeps. Always on a CPU.
 """
 
 from __future__ import annotations
@@ -24,9 +27,15 @@ import torch
 from gsfluent import has_cuda, ops
 from gsfluent.figure.markdown import enter
 from gsfluent.lab.charts.record import machine
+from gsfluent.lab.problems.contact.contact import bodies, smooth_ball
+from gsfluent.lab.problems.contact.floor import HALF
+from gsfluent.lab.world.driver import World
+from gsfluent.lab.world.walls import wall
 
 CASES = {"on a floor": False, "two halves on a floor": True}
 DX = 0.02
+SPEEDS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""At which a ball lands [P-wave speed]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,6 +114,42 @@ def measure(cells: int, device: str, repeats: int) -> list[Line]:
     ]  # fmt: skip
 
 
+def landed(speed: float, push: bool) -> tuple[float, float]:
+    """How deep a ball that lands sinks [dx], and the share of its speed that it keeps.
+
+    Args:
+        speed: At which it lands [P-wave speed].
+        push: Whether the floor pushes points; else it holds nodes.
+    """
+    points, volume = smooth_ball(5.0)
+    world = bodies(
+        [points + torch.tensor([0.13, 0.27, 5.73], dtype=torch.float64)],
+        [torch.tensor([0.0, 0.0, -speed], dtype=torch.float64)], volume=volume,
+        dtype=torch.float32, colliders=[wall(2, mode="separate")], surface=HALF if push else None,
+    )  # fmt: skip
+    deepest = [0.0]
+
+    def watch(now: World) -> None:
+        deepest[0] = max(deepest[0], -float(now.position[:, 2].min()))
+
+    world.run(1.6 / speed + 30.0 * speed**-0.2, each=watch)
+    kept = float(world.momentum()[2]) / float(world.scene.mass.double().sum()) / speed
+    return deepest[0], kept
+
+
+def depths() -> str:
+    """What nodes and points do with a ball that lands, as a Markdown table."""
+    rows = [
+        "| speed over wave speed | nodes: sinks in, keeps | points: sinks in, keeps |",
+        "|" + " --- |" * 3,
+    ]
+    for speed in SPEEDS:
+        cells = (f"{deep:.2f} dx, {kept:.2f}" for deep, kept in
+                 (landed(speed, push) for push in (False, True)))  # fmt: skip
+        rows.append(f"| {speed:g} | " + " | ".join(cells) + " |")
+    return "\n".join(rows)
+
+
 def table(lines: list[Line]) -> str:
     """The lines as a Markdown table."""
     rows = [
@@ -132,11 +177,11 @@ def main() -> int:
     options = parser.parse_args()
     if options.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no GPU, or gsfluent was built without its CUDA kernels")
+    torch.set_num_threads(1)
     if options.table is not None:
         rows = [row for path in options.table for row in path.read_text().splitlines()]
         lines = [Line(**json.loads(row)) for row in rows]
     else:
-        torch.set_num_threads(1)
         each = [measure(cells, options.device, options.repeats) for cells in options.cells]
         lines = [line for some in each for line in some]
     if options.json:
@@ -144,9 +189,9 @@ def main() -> int:
         options.json.write_text(text, encoding="utf-8")
     if options.markdown:
         page = options.markdown.read_text(encoding="utf-8")
-        options.markdown.write_text(
-            enter(page, "solver contact", table(lines), "## Contact at points"), encoding="utf-8"
-        )
+        page = enter(page, "solver contact", table(lines), "## What contact at points costs")
+        page = enter(page, "solver depth", depths(), "## How deep fast bodies sink")
+        options.markdown.write_text(page, encoding="utf-8")
     sys.stdout.write(table(lines) + "\n")
     return 0
 
