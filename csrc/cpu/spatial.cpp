@@ -35,20 +35,37 @@ bool ask(const NearestArgs& a, int64_t i, double edge, bool last) {
   bool done = last || !finite_place(place);
   int64_t middle[3], cell[3];
   double away;
-  if (cell_at(place, edge, middle))
-    for (int ring = 0; ring <= kNearestRings && !(done && ring); ++ring) {
-      const int side = 2 * ring + 1;
-      for (int number = 0; number < side * side * side; ++number) {
-        if (!cell_of_ring(middle, ring, number, cell) ||
-            square_to_cell(place, cell, edge) > std::min(worst, reach))
-          continue;
-        const int64_t bucket = bucket_of(a, cell, group_of(a.asked, i));
-        for (int32_t k = a.end[bucket] - a.count[bucket]; k < a.end[bucket]; ++k)
-          if (candidate(a, i, a.row[k], cell, edge, worst, list.index[a.wanted - 1], &away))
-            list.take(a.row[k], away);
+  if (cell_at(place, edge, middle)) {
+    // squared ways along each axis to the cells around
+    constexpr int kSide = 2 * kNearestRings + 1;
+    double way[3][kSide];
+    for (int axis = 0; axis < 3; ++axis)
+      for (int step = 0; step < kSide; ++step) {
+        const double low = double(middle[axis] + step - kNearestRings) * edge;
+        const double off = std::max(low - place[axis], place[axis] - (low + edge));
+        const double far = std::max(off - kCellSlack * edge, 0.0);
+        way[axis][step] = far * far;
       }
+    for (int ring = 0; ring <= kNearestRings && !(done && ring); ++ring) {
+      const int first = kNearestRings - ring, past = kNearestRings + ring + 1;
+      for (int x = first; x < past; ++x)
+        for (int y = first; y < past; ++y) {
+          // within the faces of the ring its cells are the first and the last
+          const bool face = x == first || x == past - 1 || y == first || y == past - 1;
+          for (int z = first; z < past; z += face ? 1 : 2 * ring) {
+            if (way[0][x] + way[1][y] + way[2][z] > std::min(worst, reach)) continue;
+            cell[0] = middle[0] + x - kNearestRings;
+            cell[1] = middle[1] + y - kNearestRings;
+            cell[2] = middle[2] + z - kNearestRings;
+            const int64_t bucket = bucket_of(a, cell, group_of(a.asked, i));
+            for (int32_t k = a.end[bucket] - a.count[bucket]; k < a.end[bucket]; ++k)
+              if (candidate(a, i, a.row[k], cell, edge, worst, list.index[a.wanted - 1], &away))
+                list.take(a.row[k], away);
+          }
+        }
       done = done || settled(a, i, worst, ring * edge * (1.0 - kCellSlack));
     }
+  }
   a.done[i] = done;
   if (done) list.finish(a.reach);
   return done;

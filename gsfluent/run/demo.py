@@ -167,6 +167,6 @@ def _run(
         seed=seed,
         force=force,
         reporter=reporter,
-        after=judge,
+        aside=judge,
         before=made,
     )

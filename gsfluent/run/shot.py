@@ -22,6 +22,7 @@ from gsfluent.errors import GsfluentError, RunError
 from gsfluent.plan.fact import seconds_left
 from gsfluent.plan.in_run import foresee_run, judge_plan
 from gsfluent.progress import LineReporter, Reporter, heard_warnings, heartbeat
+from gsfluent.results.behind import Behind
 from gsfluent.results.lock import locked
 from gsfluent.results.record import RunRecord
 from gsfluent.results.store import StageResult, StageStore
@@ -33,7 +34,7 @@ from gsfluent.stages.findings import THIN
 
 _log = logging.getLogger(__name__)
 
-AfterRun = Callable[[RunContext], dict[str, Any]]
+Aside = Callable[[RunContext], dict[str, Any]]
 
 
 def run_shot(
@@ -45,7 +46,7 @@ def run_shot(
     force: bool = False,
     reporter: Reporter | None = None,
     before: StageResult | None = None,
-    after: AfterRun | None = None,
+    aside: Aside | None = None,
     facts: Mapping[str, Any] | None = None,
     plan: bool = True,
     unlock: bool = False,
@@ -63,7 +64,8 @@ def run_shot(
         force: Redo finished stages.
         reporter: Receives progress; log lines by default.
         before: A stage done already, to stand first in ``run.json``.
-        after: Called when all stages are done; what it returns is added to ``run.json``.
+        aside: Called when the solids are there, in a thread beside the stages that follow; what it
+            returns is added to ``run.json``.
         facts: What is known before and belongs into ``run.json``.
         plan: Plan the run first, and put plan and fact beside each other into ``run.json``.
         unlock: Take the folder although a run on another machine has not given it back.
@@ -85,7 +87,7 @@ def run_shot(
     with locked(out, unlock=unlock):
         return run_in(
             shot, out, device=device, seed=seed, force=force, reporter=reporter, before=before,
-            after=after, facts=facts, plan=plan, shared=shared, solids_seed=solids_seed,
+            aside=aside, facts=facts, plan=plan, shared=shared, solids_seed=solids_seed,
             report=report,
         )  # fmt: skip
 
@@ -99,7 +101,7 @@ def run_in(
     force: bool,
     reporter: Reporter | None,
     before: StageResult | None = None,
-    after: AfterRun | None = None,
+    aside: Aside | None = None,
     facts: Mapping[str, Any] | None = None,
     plan: bool = True,
     shared: Path | None = None,
@@ -117,10 +119,12 @@ def run_in(
     context = RunContext(shot, out, device, first, store, record, reporter or LineReporter())
     start = time.perf_counter()
 
-    foreseen = None
+    foreseen, told = None, dict[str, Any]()
 
     def settle(context: RunContext) -> None:
         nonlocal foreseen
+        if aside is not None:
+            beside.do(lambda: told.update(aside(context)))
         context.seed, store.shared = seed, None
         if choose_stage(context):  # the plan was made with other cells
             foreseen = foresee_run(context, plan=plan)
@@ -154,13 +158,13 @@ def run_in(
         with (
             heard_warnings("gsfluent") as heard,
             heartbeat("gsfluent", at_work, adds=progressed) as watched,
+            Behind(device=device, threads=1) as beside,
         ):
             context.reporter = watched(context.reporter)
             foreseen = foresee_run(context, plan=plan)
             begun = time.perf_counter()
             run_stages(context, settle)
-        if after is not None:
-            record.values.update(after(context))
+        record.values.update(told)
         judge_plan(context, foreseen)
     except BaseException as error:
         _withdraw_film(context)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -153,7 +154,7 @@ class Body:
         """Its material and those of its parts."""
         return (self.material, *(part.material(self.material) for part in self.parts))
 
-    @property
+    @functools.cached_property
     def breaking_speed(self) -> float:
         """Speed of the slowest strike that starts to break its weakest part [m/s], or infinity."""
         return min(material.breaking_speed for material in self.materials)

@@ -94,7 +94,7 @@ def row(name: str, record: dict[str, Any]) -> str:
         str(simulation["particles"]),
         str(max(simulation["per_frame"]["fragments"])),
         f"{max(x for x in holes['hole_fraction_before'] if x is not None):.4f}",
-        f"{max(holes['hole_fraction']):.4f}",
+        f"{max(filter(None, holes['hole_fraction']), default=0.0):.4f}",
         f"{seconds:.0f}",
         record["verdict"],
     ]

@@ -41,13 +41,22 @@ struct Softened {
   T outside;  // u^2 + w^2 - 1 of the trial state: above zero it yields
 };
 
-// From the trial state (d, n = |d|, J^2 - 1) with `epsilon` of NaccOptions and k = 2. Pressures are
-// in units of kappa.
+// nacc_project and alpha_step at one surface, k = 2.
 template <typename T>
-GSF_HOST_DEVICE Softened<T> softened_return(const NaccMaterial<T>& m, T epsilon, const Sym3<T>& d,
-                                            T n, T j2m1) {
+struct PackReturn {
+  T cross, back;  // where the return line meets the surface, and the returned pressure [kappa]
+  T r;            // factor on the deviator
+  T step;         // of alpha
+  T outside;      // u^2 + w^2 - 1 of the trial state: above zero it yields
+};
+
+// From the trial state (n = |d|, J^2 - 1) to the surface of compressive tip `p0`, with `epsilon` of
+// NaccOptions. Pressures are in units of kappa; ln J by its series, which |2 cross| must be below.
+template <typename T>
+GSF_HOST_DEVICE PackReturn<T> return_to(const NaccMaterial<T>& m, T epsilon, T p0, T n, T j2m1,
+                                        T log_j2) {
   using std::sqrt;
-  const T beta = min(m.cohesion, T(kCohesionMax)), p0 = T(kYieldPressureFloor), tip = -beta * p0;
+  const T beta = min(m.cohesion, T(kCohesionMax)), tip = -beta * p0;
   const T middle = T(0.5) * (T(1) - beta) * p0, a = T(0.5) * (T(1) + beta) * p0;
   const T b = m.friction * a / sqrt(T(1) + T(2) * beta);
   const T p = T(-0.5) * j2m1, q = T(1.224744871391589) * (m.mu / m.kappa) * n;
@@ -58,26 +67,41 @@ GSF_HOST_DEVICE Softened<T> softened_return(const NaccMaterial<T>& m, T epsilon,
   const T center = (T(1) - epsilon) * (near * near * near);
   const T gap = u - center, g = T(1) - center * center;
   const T t = min(T(1), g / max(center * gap + sqrt(gap * gap + w * w * g), T(1e-30)));
-  const T cross = middle + a * (center + t * gap);
+  PackReturn<T> out;
+  out.cross = middle + a * (center + t * gap);
   const T inside = clamp(p, tip, p0);
-  const T back = clamp(cross, min(inside, T(0)), max(inside, T(0)));
-  const T beside = sqrt(max((p0 - back) * (back - tip), T(0))) / a;
-  const T r = min(T(1), b * select(back == cross, t * w, beside) / max(q, T(1e-30)));
-  Softened<T> out;
+  out.back = clamp(out.cross, min(inside, T(0)), max(inside, T(0)));
+  const T beside = sqrt(max((p0 - out.back) * (out.back - tip), T(0))) / a;
+  out.r = min(T(1), b * select(out.back == out.cross, t * w, beside) / max(q, T(1e-30)));
   out.outside = u * u + w * w - T(1);
   // alpha_step
-  const T volume = T(0.5) * (log1p_series(j2m1) - log1p_series(T(-2) * cross));
-  const T shear = m.shear_damage * (T(1) - r) * n * T(0.4082482904638631);
+  const T volume = T(0.5) * (log_j2 - log1p_series(T(-2) * out.cross));
+  const T shear = m.shear_damage * (T(1) - out.r) * n * T(0.4082482904638631);
   out.step = clamp(volume + shear, T(-kAlphaStepMax), T(kAlphaStepMax));
-  out.d = r * d;
+  return out;
+}
+
+// The state on the surface: strain_from_isochoric.
+template <typename T>
+GSF_HOST_DEVICE Softened<T> returned_state(const PackReturn<T>& found, const Sym3<T>& d) {
+  Softened<T> out;
+  out.outside = found.outside;
+  out.step = found.step;
+  out.d = found.r * d;
   out.n2 = norm2(out.d);
-  out.j2m1 = T(-2) * back;
-  // strain_from_isochoric
+  out.j2m1 = T(-2) * found.back;
   const T z = inverse_cube_root_series(out.j2m1), y = unit_det_shift_small(out.d);
   const T s = -z / (T(1) + z);  // J^(2/3) - 1
   out.isochoric = T(1) + z;
   out.strain = add_diagonal((T(1) + s) * out.d, y + s * (T(1) + y));
   return out;
+}
+
+template <typename T>
+GSF_HOST_DEVICE Softened<T> softened_return(const NaccMaterial<T>& m, T epsilon, const Sym3<T>& d,
+                                            T n, T j2m1) {
+  const T p0 = T(kYieldPressureFloor);
+  return returned_state(return_to(m, epsilon, p0, n, j2m1, log1p_series(j2m1)), d);
 }
 
 }  // namespace gsf

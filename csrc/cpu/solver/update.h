@@ -7,6 +7,7 @@
 #include "core/material/rankine.h"
 #include "cpu/solver/packet.h"
 #include "cpu/solver/principal.h"
+#include "cpu/solver/yield.h"
 
 namespace gsf::cpu {
 
@@ -193,6 +194,28 @@ void finish_packet(const SolverView<T>& s, const Packet<T>& packet, uint32_t rea
         whole &= ~softens;
       } else {
         softens = Int{};
+      }
+      // with strength
+      Int yields = plain & nacc & ~holds & ~softens & (alpha >= P(kAlphaMin)) &
+                   (alpha <= P(kAlphaMax)) & (abs(j2m1) <= P(kSoftenedVolume)) &
+                   (row[2] >= P(kFrictionMin)) & (row[5] >= P(0));
+      if constexpr (with_springs(kLaws))
+        yields &= packet.load1(s.viscous, kViscousColumns, kViscousColumns - 1) <= P(0);
+      if (s.options.k == T(2) && s.options.implicit_alpha && mask_bits(yields) != 0) {
+        const NaccMaterial<P> m{row[0], row[1], row[2], cohesion, row[4], row[5]};
+        const Yielded<T> now =
+            yield_pack<T>(m, P(s.options.epsilon), d, sqrt(n2), j2m1, alpha, yields);
+        yields &= now.good & (now.state.outside > P(kYieldSlack<T>)) &
+                  (now.state.n2 <= P(kSoftenedShear * kSoftenedShear));
+        mix(yields, e, now.state.strain);
+        mix(yields, d, now.state.d);
+        j2m1 = select<T>(yields, now.state.j2m1, j2m1);
+        isochoric = select<T>(yields, now.state.isochoric, isochoric);
+        n2 = select<T>(yields, now.state.n2, n2);
+        alpha_after = select<T>(yields, now.alpha, alpha_after);
+        peak_after = select<T>(yields, max(peak, now.alpha), peak_after);
+        whole &= ~yields | (peak_after < P(0));
+        softens |= yields;
       }
       plain &= ~nacc | softens | (holds & (alpha <= peak));
       loss = select<T>(nacc, row[7], loss);

@@ -186,8 +186,12 @@ def floating(
 
 
 def _cameras(views: Sequence[TrainView]) -> list[Camera]:
+    # one copy from the device for all
+    viewmats = torch.stack([view.viewmat for view in views]).double().cpu()
+    lenses = torch.stack([view.K for view in views]).double().cpu()
     return [
-        Camera(view.viewmat.double().cpu(), view.K.double().cpu(), *view.size) for view in views
+        Camera(viewmat, K, *view.size)
+        for viewmat, K, view in zip(viewmats, lenses, views, strict=True)
     ]
 
 

@@ -2,9 +2,10 @@
 
 "Before" is what one gets by moving each splat rigidly with the material point that was nearest at
 the start, as the peers do: no binding to pieces, no repair. Holes in the film are counted in its
-own pictures, every frame. What needs pictures of its own (before, flicker, and the view of one of
-three cameras around the matter) is measured in two frames of every twelve in which something is
-broken, or it would cost as much as the film; without light, from the direction-independent colours.
+own pictures: every frame of liquids and of what has broken, one of twelve of what is whole. What
+needs pictures of its own (before, flicker, and the view of one of three cameras around the matter)
+is measured in two frames of every twelve in which something is broken, or it would cost as much as
+the film; without light, from the direction-independent colours.
 """
 
 from __future__ import annotations
@@ -142,15 +143,18 @@ class FilmFigures:
             depth: Their expected depth there [m], [H, W].
         """
         index = len(self._values["flicker"])
-        view, clear = small(camera), clear_of(frame)
+        clear, added = clear_of(frame), frame.gaussians.count - frame.carried
+        for values in self._values.values():
+            values.append(None)
+        self._set("transition_gaussians", added)
+        whole = not added and not bool((frame.damage >= 1.0).any())
+        if whole and clear is None and index % self._every:
+            return  # nothing has parted: as in the frame before
+        view = small(camera)
         places = frame.shown
         matter = MatterView.of(places, frame.volumes, view)
         film = Holes.of(alpha, depth, matter)
-        for values in self._values.values():
-            values.append(None)
-        added = frame.gaussians.count - frame.carried
-        self._set("transition_gaussians", added)
-        if not added and not bool((frame.damage >= 1.0).any()):
+        if whole:
             self._enter("", [film, film])
             return
         turn, self._broken = self._broken % self._every, self._broken + 1

@@ -116,7 +116,7 @@ class RunSource:
         except (LookupError, ValueError, TypeError, RecursionError):
             return {}
         holes = (self._read_record().get("render") or {}).get("hole_fraction") or []
-        if index < len(holes) and not self.running:
+        if index < len(holes) and holes[index] is not None and not self.running:
             facts["holes"] = holes[index]
         return facts
 

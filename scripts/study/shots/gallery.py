@@ -133,7 +133,7 @@ def run(name: str, options: argparse.Namespace, device: torch.device) -> dict[st
         "wall_seconds": time.perf_counter() - start,
         "stages": {stage["name"]: round(stage["seconds"], 2) for stage in record["stages"]},
         "resumed": [stage["name"] for stage in record["stages"] if stage["resumed"]],
-        "hole_fraction": max(record["render"]["hole_fraction"]),
+        "hole_fraction": max(filter(None, record["render"]["hole_fraction"]), default=0.0),
     }
 
 

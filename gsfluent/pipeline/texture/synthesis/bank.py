@@ -145,8 +145,7 @@ def _draw(
     """
     height, width = photo.mask.shape
     # Halton points (Halton 1960) shifted by a random vector: even coverage, few misses
-    number = np.arange(1, 64 * count)
-    place = np.stack([_halton(number, 2), _halton(number, 3)], 1)
+    place = np.stack([_halton(64 * count, 2), _halton(64 * count, 3)], 1)
     place = (place + rng.random(2)) % 1.0
     index = torch.from_numpy(np.floor(place * [height, width]).astype(np.int64))
     index = index.to(photo.mask.device)
@@ -164,16 +163,13 @@ def _draw(
     return patches, photo.guide[index[:, 0], index[:, 1]], usable
 
 
-def _halton(number: np.ndarray, base: int) -> np.ndarray:
-    """Radical inverse of integers in a base."""
-    result = np.zeros(len(number))
-    fraction = 1.0 / base
-    rest = number.copy()
-    while rest.any():
-        result += fraction * (rest % base)
-        rest //= base
+def _halton(count: int, base: int) -> np.ndarray:
+    """Radical inverses of 1 to ``count - 1`` in a base."""
+    found, fraction = np.zeros(1), 1.0 / base
+    while len(found) < count:  # those with a digit more
+        found = np.concatenate([found + fraction * digit for digit in range(base)])
         fraction /= base
-    return result
+    return found[1:count]
 
 
 def _turned(patches: Tensor, turn: Tensor) -> Tensor:
