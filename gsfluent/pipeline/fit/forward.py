@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsfluent.data import Gaussians, Solid
+from gsfluent.data import Gaussians
 from gsfluent.errors import InputError
 from gsfluent.materials import LAWS, Material
 from gsfluent.pipeline.colliders.rigid import RigidSet
@@ -31,9 +31,7 @@ from gsfluent.pipeline.matter.points import (
 from gsfluent.scene.scene import Scene
 from gsfluent.targets.target import Motion, Setting
 
-CFL = 0.5
-TRIED, WIDER = 8, 0.06
-"""Spacings of points that are tried to either side, and how far the last is from the first."""
+CFL = 0.4
 HASTE = 1.3
 """Margin of the time step for waves that matter under pressure carries faster."""
 
@@ -60,31 +58,6 @@ class Matter(NamedTuple):
     copies: int
 
 
-def lattice(solid: Solid, spacing: float) -> Tensor:
-    """Points of an unshaken lattice about the middle of a solid that fill it best, float64 [N, 3].
-
-    A few points along an edge are 2 % too many or too few, which lands a coarse body millimetres
-    early or late. So spacings about the one that is asked for are tried, and the one whose points
-    have the volume and the extent of the solid most nearly is taken.
-    """
-    inside = solid.voxel_centers().double().cpu()
-    middle = inside.mean(dim=0)
-    extent = ((inside - middle).square().mean(dim=0) + solid.voxel**2 / 12.0).sqrt()
-    volume = len(inside) * solid.voxel**3
-    best, found = math.inf, inside
-    for k in sorted(range(-TRIED, TRIED + 1), key=abs):
-        apart = spacing * (1.0 + WIDER * k / TRIED)
-        points = sample_points(solid, apart, jitter=0.0)
-        # a lattice that meets the faces of voxels takes more on one side than on the other
-        points = points + (middle - points.mean(dim=0))
-        wide = ((points - middle).square().mean(dim=0) + apart**2 / 12.0).sqrt()
-        off = abs(len(points) * apart**3 / volume - 1.0) / 3.0
-        off += float((wide / extent - 1.0).abs().mean())
-        if off < best - 1e-9:
-            best, found = off, points
-    return found
-
-
 class Forward:
     """A scene on a grid, to be run again and again.
 
@@ -92,6 +65,7 @@ class Forward:
         scene: Bodies of laws that do not break, rigid colliders that stand or move steadily.
         times: Of the frames [s], ascending from 0.
         dx: Grid spacing [m].
+        seed: Of the point positions, as far as anything is random.
         device: Where the solver runs; what it shows lies on the CPU.
 
     Raises:
@@ -99,8 +73,9 @@ class Forward:
     """
 
     def __init__(
-        self, scene: Scene, times: list[float], dx: float, device: torch.device | str = "cpu"
-    ) -> None:
+        self, scene: Scene, times: list[float], dx: float, seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
         self.scene, self.times, self.dx, self.device = scene, times, dx, torch.device(device)
         self.runs = 0
         step = dx / POINTS_PER_CELL ** (1 / 3)
@@ -114,7 +89,10 @@ class Forward:
                 raise InputError(
                     f"fit: {body.name!r} is shot or poured", "learn from objects that are there"
                 )
-            points = lattice(body.solid, step / body.frame.scale)
+            points = sample_points(body.solid, step / body.frame.scale, seed=seed, jitter=0.0)
+            # a lattice that meets the faces of voxels takes more on one side than on the other
+            middle = body.solid.voxel_centers().double().cpu().mean(dim=0)
+            points = points + (middle - points.mean(dim=0))
             count = points.shape[0]
             layers = [body.material, *(part.material(body.material) for part in body.parts)]
             index = torch.zeros(count, dtype=torch.int64)

@@ -222,7 +222,7 @@ class Problem:
         told = moved > 1.0
         part = np.where(told, sizes[:, 1:] / np.maximum(moved, 1.0), 0.0)
         part = np.sqrt((part**2).sum(axis=0) / np.maximum(told.sum(axis=0), 1))
-        sizes[:, 1:] = np.maximum(sizes[:, :1], np.minimum(part, UNSURE) * moved)
+        sizes[:, 1:] = np.maximum(sizes[:, :1], np.minimum(part, 1.0) * moved)
         self.trust[:frames] = 1.0 / sizes
 
     def _tell_patterns(self, motion: Motion, frames: int, frame: NDArray[np.int64]) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fit_scenes import SIDE, elastic, scene, seen, solid
+from fit_scenes import SIDE, elastic, scene, seen
 
 from gsfluent import materials
 from gsfluent.data import Camera
@@ -17,7 +17,7 @@ from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
-from gsfluent.pipeline.fit.forward import Forward, lattice
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, _covariance, in_stages, lasting, linearise, search
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
@@ -86,17 +86,6 @@ def test_the_motion_is_that_of_the_closed_form_before_contact() -> None:
         (arm[0, :, :2] * arm[2, :, :2]).sum(),
     )
     assert float(turned) == pytest.approx(0.2, abs=0.02)
-
-
-def test_a_coarse_lattice_has_the_extent_of_its_solid() -> None:
-    ball = solid("ball", voxels=33)
-    inside = ball.voxel_centers().double()
-    for spacing in (0.018, 0.022, 0.026, 0.03):
-        points = lattice(ball, spacing)
-        assert torch.allclose(points.mean(dim=0), inside.mean(dim=0), atol=1e-12)
-        wide = (points.var(dim=0, unbiased=False) + spacing**2 / 12.0).sqrt()
-        wanted = (inside.var(dim=0, unbiased=False) + ball.voxel**2 / 12.0).sqrt()
-        assert torch.allclose(wide, wanted, rtol=0.01)
 
 
 def test_what_a_grid_shifts_is_noise_of_the_body_not_of_its_points(tracks: Any) -> None:
