@@ -212,6 +212,20 @@ def test_a_run_cut_in_two_goes_on_as_if_it_had_not_been() -> None:
         assert error(getattr(cut, name), getattr(whole, name)) < 1e-12, name
 
 
+def test_a_viscous_liquid_moves_alike_however_its_steps_are_called() -> None:
+    given = scene(cells=4)
+    del given["deformation"], given["alpha"]
+    given["law"] = torch.tensor([4], dtype=torch.int32)
+    given["params"] = torch.tensor([[0.0, 8e4, 60.0, 0.0, 0.0, 0.0, 1000.0, 7.0]]).double()
+    given["velocity"][:, 0] += 20.0 * (given["position"][:, 2] - given["position"][:, 2].mean())
+    whole, parts = ops.Solver(**given, dt=DT), ops.Solver(**given, dt=DT)
+    whole.advance(steps=STEPS)
+    for _ in range(STEPS):
+        parts.advance(steps=1)
+    assert error(parts.velocity, whole.velocity) < 1e-9
+    assert error(parts.affine, whole.affine) < 1e-9
+
+
 def test_a_time_is_met_exactly() -> None:
     solver = ops.Solver(**small("elastic"))
     for until in (0.0021, 0.004):

@@ -180,6 +180,15 @@ GSF_HOST_DEVICE LawResult<T> corotated(const MaterialRow<T>& m, const Sym3<T>& e
   return out;
 }
 
+// J eta (A + A^T - 2/3 tr A I) of a velocity gradient A, or of an increment with J eta / dt.
+template <typename T>
+GSF_HOST_DEVICE Sym3<T> newtonian_stress(T scale, const Mat3<T>& a) {
+  const T mean = T(2.0 / 3.0) * (a.m[0] + a.m[4] + a.m[8]);
+  const Sym3<T> rate = {T(2) * a.m[0] - mean, T(2) * a.m[4] - mean, T(2) * a.m[8] - mean,
+                        a.m[1] + a.m[3],      a.m[2] + a.m[6],      a.m[5] + a.m[7]};
+  return scale * rate;
+}
+
 // --- weakly compressible fluid: p = K/gamma (J^-gamma - 1), no tension, Newtonian viscosity ---
 // The strain stays isotropic, e = (J^(2/3) - 1) I. J follows det(I + A), as the positions do that
 // are moved by the same velocities; 1 + tr A would lose the difference at every step, and the pool
@@ -217,14 +226,8 @@ GSF_HOST_DEVICE LawResult<T> fluid(const MaterialRow<T>& m, const Sym3<T>& strai
     pressure = m.kappa / gamma * expm1(T(-1.5) * gamma * log1p(x));
   }
   out.stress = {-j * pressure, -j * pressure, -j * pressure, T(0), T(0), T(0)};
-  if (m.strength > T(0) && dt > T(0)) {
-    const Mat3<T>& a = increment;
-    const T scale = j * m.strength / dt;
-    const T mean = T(2.0 / 3.0) * (a.m[0] + a.m[4] + a.m[8]);
-    const Sym3<T> rate = {T(2) * a.m[0] - mean, T(2) * a.m[4] - mean, T(2) * a.m[8] - mean,
-                          a.m[1] + a.m[3],      a.m[2] + a.m[6],      a.m[5] + a.m[7]};
-    out.stress = out.stress + scale * rate;
-  }
+  if (m.strength > T(0) && dt > T(0))
+    out.stress = out.stress + newtonian_stress(j * m.strength / dt, increment);
   return out;
 }
 

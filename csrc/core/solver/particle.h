@@ -498,6 +498,12 @@ GSF_HOST_DEVICE void prime_particle(const SolverView<T>& s, int64_t p, bool meas
   ReturnMapped<T> state =
       law_step<T, kLaws>(load_strain(s, p), alpha, none, s.law[row], material, s.options, span);
   const bool loses = s.law[row] == kNacc || (kLaws == kDamageField && s.law[row] == kPhaseField);
+  if (s.law[row] == kFluid && material.strength > T(0)) {  // its strain moves in a step, not here
+    using std::sqrt;
+    const T stretched = T(1) + state.strain.xx;
+    state.stress =
+        state.stress + newtonian_stress(stretched * sqrt(stretched) * material.strength, c);
+  }
   if constexpr (with_springs(kLaws))
     if (s.law[row] == kElastic || s.law[row] == kNacc)
       viscous_particle(s, p, r, load_strain(s, p), alpha, none, T(0), s.law[row] == kNacc, material,

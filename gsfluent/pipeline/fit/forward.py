@@ -31,7 +31,7 @@ from gsfluent.pipeline.matter.points import (
 from gsfluent.scene.scene import Scene
 from gsfluent.targets.target import Motion, Setting
 
-CFL = 0.5
+CFL = 0.4
 HASTE = 1.3
 """Margin of the time step for waves that matter under pressure carries faster."""
 

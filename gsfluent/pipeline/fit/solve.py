@@ -215,8 +215,6 @@ class Problem:
         gap, frame = self._gaps(motion, frames, self.observer.pair(motion))
         if len(gap) < TELLING * frames:
             return
-        if not self.modes:
-            self._tell_patterns(motion, frames, frame)
         sizes = np.maximum(self._sizes(gap, frame, frames), QUIET)
         # three numbers of a frame may be small by chance, and a velocity that follows them would
         # keep them so: patterns are missed by one part of what the finer grid changes of them

@@ -88,6 +88,21 @@ def test_the_motion_is_that_of_the_closed_form_before_contact() -> None:
     assert float(turned) == pytest.approx(0.2, abs=0.02)
 
 
+def test_what_a_grid_shifts_is_noise_of_the_body_not_of_its_points(tracks: Any) -> None:
+    made = problem(Points(tracks), scene(elastic(1e5)), NAMES[:1])
+    frames = len(tracks)
+    finer = Forward(made.forward.scene, made.forward.times, 0.5 * DX)
+    made.refine(finer, made.unknowns.start, frames)
+    shift, turn, strain = made.trust[-1, 1:]
+    assert shift < 0.2 * made.trust[-1, 0] and max(turn, strain) <= 1.0
+    assert (np.diff(made.trust[:, 1:], axis=0) <= 0.0).all()  # no pattern is surer later
+    gap = np.random.default_rng(0).normal(size=3 * tracks.shape[1] * (frames - 1))
+    frame = np.repeat(np.arange(1, frames), 3 * tracks.shape[1])
+    np.testing.assert_allclose(made.weighed(made.weighed(gap, frame), frame, -1.0), gap)
+    even = np.where(frame == frames - 1, np.tile([1.0, 0.0, 0.0], len(frame) // 3), 0.0)
+    np.testing.assert_allclose(made.weighed(even, frame), shift * even, atol=1e-12)
+
+
 def test_noise_is_in_the_bands(tracks: Any) -> None:
     """3 mm on each coordinate: the truth within three of the sd that the fit itself gives."""
     noisy = tracks + 3e-3 * np.random.default_rng(1).standard_normal(tracks.shape)
