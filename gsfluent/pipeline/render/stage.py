@@ -52,6 +52,8 @@ _RESOLUTIONS = (512, 1024)
 # Room of the occupancy grid for matter that flies apart; beyond, a new one is laid out.
 _ROOM = 1.25
 _NEAR = 0.01  # camera z [m] from which on splats are drawn
+# Opacity of a splat of a liquid below which it fades; above, its thickness says how opaque it is.
+_FADED = 0.3
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ class Render(Stage):
             through = clear.rows.masked_scatter(clear.rows, clear.attenuation.isfinite())
             if not bool(through.all()):
                 dense = gaussians.select((~through).nonzero()[:, 0])
-            liquid = _liquid(everything, clear, camera, view)
+            liquid = _liquid(everything, _there(gaussians, clear), clear, camera, view)
             rest = (~clear.rows).nonzero()[:, 0]
             gaussians = gaussians.select(rest)
             groups, gloss, plates, rigid, wet = (
@@ -326,10 +328,15 @@ class Render(Stage):
         return lit, room
 
 
+def _there(gaussians: Gaussians, clear: Clear) -> Tensor:
+    """How far splats of liquids are drawn, [M]: what tension draws into another drop has faded."""
+    return (gaussians.opacities[clear.rows.nonzero()[:, 0]] / _FADED).clamp(max=1.0)
+
+
 def _as_body(gaussians: Gaussians, clear: Clear, eye: Tensor) -> Gaussians:
     """The splats, those of liquids as transparent as their bodies are."""
     rows = clear.rows.nonzero()[:, 0]
-    body = body_opacities(gaussians.select(rows), clear, eye)
+    body = body_opacities(gaussians.select(rows), clear, eye) * _there(gaussians, clear)
     return gaussians.replace(
         opacities=gaussians.opacities.index_copy(0, rows, body.to(gaussians.opacities))
     )
@@ -387,6 +394,7 @@ class _Liquid:
 
 def _liquid(
     everything: tuple[Gaussians, Tensor | None],
+    there: Tensor,
     clear: Clear,
     camera: Camera,
     view: tuple[Tensor, Tensor],
@@ -395,6 +403,7 @@ def _liquid(
 
     Args:
         everything: All splats, the liquids' as transparent as their bodies, and their groups.
+        there: How far each of the liquids is drawn, [M].
         clear: The liquids.
         camera: Where from.
         view: Its matrices.
@@ -406,7 +415,7 @@ def _liquid(
     spacing = max(float(clear.volume.median()) ** (1.0 / 3.0), TENSION)
     infinite = clear.attenuation.isinf()
     opaque = bool(infinite.all())
-    front = mine.replace(opacities=torch.full_like(mine.opacities, OPACITY))
+    front = mine.replace(opacities=(OPACITY * there).to(mine.opacities))
     normals = surface_normals(front, plate_normals(front, eye), eye)
     seen = draw_at(front, *view, size, near=_NEAR, depth=True, normals=normals)
     assert seen.depth is not None and seen.normal is not None  # asked for

@@ -240,3 +240,18 @@ def test_a_film_of_fine_points_has_the_rim_of_a_liquid() -> None:
     rim.scatter_reduce_(0, sector, rows.hypot(columns), "amax")
     assert float(rim.min()) > 80.0 and float(rim.std()) < 1.2
     assert float(made.image[100:140, 100:140].std(dim=(0, 1)).max()) < 0.01
+
+
+def test_a_drop_that_has_faded_is_not_drawn() -> None:
+    place = torch.tensor([[0.0, 0.0, 0.0]])
+    drop = Gaussians.from_colors(place, torch.tensor([0.3 * H]), torch.ones(1, 3), opacities=0.95)
+    clear = Clear(
+        torch.ones(1, dtype=torch.bool), torch.tensor([H**3]), torch.tensor([math.inf]),
+        torch.tensor([0.5, 60.0]),
+    )  # fmt: skip
+    found = []
+    for opacity in (0.95, 0.4, 0.15, 0.0):
+        shown = drop.replace(opacities=torch.full_like(drop.opacities, opacity))
+        found.append(float(Render(camera(), studio_light())(shown, clear=clear).alpha.max()))
+    assert found[0] > 0.9 and found[1] == found[0]
+    assert found[2] < 0.7 * found[0] and found[3] == 0.0
