@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 from fracture_resolution import DROPS, LINES, PAGE, Trial
-from rows import Row, add_law, law_of, numbers, read, table
+from rows import Row, add_law, append, law_of, numbers, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -154,9 +154,7 @@ def main(argv: list[str] | None = None) -> int:
             **fall(trial, cells, args.device),
         }  # fmt: skip
         sys.stderr.write(f"{json.dumps(row)}\n")
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        with args.out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        append(args.out, row)
     if args.out == OUT:
         page(read(args.out))
     return 0
