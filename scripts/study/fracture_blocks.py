@@ -127,7 +127,8 @@ def page(rows: list[Row]) -> None:
     """Enter the table."""
     head = (
         "law", "cells", "blocks / intact", "of them reached", "touched / touched, intact",
-        "pieces one by one, as at rest", "as they lie", "without points astray", "pieces below 1 %", "theirs", "points astray",
+        "pieces one by one, as at rest", "as they lie", "without points astray",
+        "pieces below 1 %", "theirs", "points astray",
         "looks, s of all",
     )  # fmt: skip
     lines = [
