@@ -27,7 +27,7 @@ from typing import Any
 
 import torch
 from fracture_resolution import LINES, MELON, PAGE, Trial, link_area
-from rows import NAMES, Row, add_law, law_of, numbers, preset_of, read, table
+from rows import NAMES, Row, add_law, append, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -370,8 +370,7 @@ def main(argv: list[str] | None = None) -> int:
                     continue
                 row = study(trial, cells, seed, args.device)
                 sys.stderr.write(f"{json.dumps(row)}\n")
-                with args.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(row) + "\n")
+                append(args.out, row)
     if args.out == OUT:
         put("fracture resolution account", page_table(read(args.out)))
     return 0

@@ -21,7 +21,7 @@ from typing import Any
 
 import torch
 from fracture_resolution import DROPS, LINES, PAGE, Trial
-from rows import Row, add_law, law_of, numbers, read, table
+from rows import Row, add_law, append, law_of, numbers, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -42,6 +42,16 @@ NEAR = 2.0
 def blocks(position: Tensor, dx: float) -> int:
     """Blocks of the grid that points [N, 3] reach."""
     return ops.build_blocks(position.float(), dx).coords.shape[0] if len(position) else 0
+
+
+def touched(position: Tensor, dx: float) -> int:
+    """Blocks with a node within the kernel of points [N, 3] as they are: those of blocks() have a
+    cell to spare, so that they need not be built anew at every step."""
+    cell = torch.floor(position.double() / dx - 0.5).to(torch.int64)
+    ends = torch.stack([cell >> 2, (cell + 2) >> 2], dim=1)  # [N, 2, 3]
+    corner = torch.cartesian_prod(*[torch.arange(2)] * 3)  # [8, 3]
+    found = ends[:, corner, torch.arange(3)]
+    return torch.unique(found.reshape(-1, 3), dim=0).shape[0]
 
 
 def hanging(position: Tensor, unit: Tensor, reach: float) -> Tensor:
@@ -69,6 +79,7 @@ def measure(run: Run) -> Row:
     return {
         "stored": run.stepper.blocks, "reached": blocks(x, matter.dx),
         "intact": blocks(matter.rest.cpu(), matter.dx),
+        "touched": touched(x, matter.dx), "touched_intact": touched(matter.rest.cpu(), matter.dx),
         "pieces": len(ids), "now": sum(now), "held": sum(held),
         "rest": sum(blocks(rest[rows], matter.dx) for rows in parts),
         "small": len(small), "of_small": sum(now[i] for i in small),
@@ -115,14 +126,17 @@ def _timed(owner: Any, name: str, spent: dict[str, float], device: str) -> None:
 def page(rows: list[Row]) -> None:
     """Enter the table."""
     head = (
-        "law", "cells", "blocks / intact", "of them reached", "pieces one by one, as at rest",
-        "as they lie", "without points astray", "pieces below 1 %", "theirs", "points astray",
+        "law", "cells", "blocks / intact", "of them reached", "touched / touched, intact",
+        "pieces one by one, as at rest", "as they lie", "without points astray",
+        "pieces below 1 %", "theirs", "points astray",
         "looks, s of all",
     )  # fmt: skip
     lines = [
         [
             r["law"], str(r["cells"]),
-            *(f"{r[k] / r['intact']:.2f}" for k in ("stored", "reached", "rest", "now", "held")),
+            *(f"{r[k] / r['intact']:.2f}" for k in ("stored", "reached")),
+            f"{r['touched'] / r['touched_intact']:.2f}" if "touched" in r else "-",
+            *(f"{r[k] / r['intact']:.2f}" for k in ("rest", "now", "held")),
             str(r["small"]), f"{r['of_small'] / r['intact']:.2f}",
             f"{100.0 * r['astray'] / r['points']:.2g} %",
             f"{r['looks']:.1f} of {r['seconds']:.1f}",
@@ -154,9 +168,7 @@ def main(argv: list[str] | None = None) -> int:
             **fall(trial, cells, args.device),
         }  # fmt: skip
         sys.stderr.write(f"{json.dumps(row)}\n")
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        with args.out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        append(args.out, row)
     if args.out == OUT:
         page(read(args.out))
     return 0

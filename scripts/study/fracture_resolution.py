@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from rows import Row, add_law, law_of, numbers, preset_of, read, table
+from rows import Row, add_law, append, law_of, numbers, preset_of, read, table
 from torch import Tensor
 
 from gsfluent import ops
@@ -269,7 +269,7 @@ def thrown(
 RADII = {"watermelon": 0.12, "chocolate": 0.03, "glass": 0.03}
 
 
-def run_bench(name: str, cells: int, seeds: int, device: str, law: str) -> Row:
+def run_bench(name: str, cells: int, seeds: int, device: str, law: str = "") -> Row:
     """An ensemble of throws on shifted grids."""
     radius = RADII[name]
     build = partial(thrown, name, radius, law=law)
@@ -348,7 +348,6 @@ def known(row: Row, key: Row) -> bool:
 def run_all(todo: Sequence[Job], out: Path, device: str) -> None:
     """Run what is not there yet, one line each."""
     rows = [r for r in read(out) if r.get("device") == device]
-    out.parent.mkdir(parents=True, exist_ok=True)
     for number, job in enumerate(todo, 1):
         name = " ".join(f"{k}={v}" for k, v in job.key.items())
         if any(known(row, job.key) for row in rows):
@@ -361,8 +360,7 @@ def run_all(todo: Sequence[Job], out: Path, device: str) -> None:
         }  # fmt: skip
         shown = {k: v for k, v in row.items() if k not in ("runs", "machine", "commit")}
         sys.stderr.write(f"    {json.dumps(shown)}\n")
-        with out.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        append(out, row)
 
 
 # --- page ---

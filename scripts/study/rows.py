@@ -57,6 +57,16 @@ def read(path: Path) -> list[Row]:
     return rows
 
 
+def append(path: Path, row: Row) -> None:
+    """Add a line to a file; one that was cut off before it stays a line of its own."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b") as file:
+        if file.tell():
+            file.seek(-1, 2)
+        whole = not file.tell() or file.read() == b"\n"
+        file.write(("" if whole else "\n").encode() + json.dumps(row).encode() + b"\n")
+
+
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]

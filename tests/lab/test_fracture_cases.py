@@ -24,10 +24,12 @@ from gsfluent.fracturebench.scenes import plane as fracture_plane
 from gsfluent.fracturebench.scenes import rock as fracture_rock
 from gsfluent.fracturebench.scenes.rows import levels, moduli, shape_noise
 from gsfluent.fracturebench.shapes import box, elastic, free
+from gsfluent.lab.frozen.answer import rows as answer_rows
 from gsfluent.lab.frozen.answer import run_case
 from gsfluent.lab.problems.fracture.spall import spall_strength
 from gsfluent.lab.world.shapes import nacc
-from gsfluent.pipeline.matter.crack_band import fracture_energy
+from gsfluent.ops.plasticity import LAWS
+from gsfluent.pipeline.matter.crack_band import BAND_CELLS, fracture_energy
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {
@@ -73,6 +75,25 @@ def test_a_row_says_what_its_parameters_mean(name: str) -> None:
         # strength of tens of percent: the energy is linear in the softening no more
         soft = name in ("shatter", "struck_rock")
         assert m["fracture_energy"] == pytest.approx(energy, rel=0.35 if soft else 0.06)
+
+
+@pytest.mark.parametrize("name", ["double_cantilever", "notch_tension"])
+def test_a_row_by_rankine_holds_and_takes_what_it_states(name: str) -> None:
+    scene = find(name).build(1 / 32, 4)
+    laws, table, alpha = answer_rows(scene, "rankine")
+    for number, m in enumerate(scene.materials):
+        if m["law"] != "nacc":
+            continue
+        kappa, beta, xi, damage = (float(table[number, i]) for i in (1, 3, 4, 5))
+        size = xi * -float(alpha[torch.from_numpy(scene.material) == number][0])
+        assert int(laws[number]) == LAWS["nacc"] and damage <= -1.0
+        strength = beta * kappa * math.sinh(size)
+        if name == "double_cantilever":
+            assert strength == pytest.approx(m["tensile_strength"], rel=1e-6)
+        else:  # more than this grid can hold with the energy
+            assert 0.8 * m["tensile_strength"] < strength < m["tensile_strength"]
+        taken = beta * kappa * (math.cosh(size) - 1.0) / xi
+        assert taken * BAND_CELLS * scene.dx == pytest.approx(m["fracture_energy"], rel=1e-6)
 
 
 def test_no_case_is_left_out_of_these_tests() -> None:

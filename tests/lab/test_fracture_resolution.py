@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -78,6 +79,11 @@ def test_a_fall_is_measured_once_and_entered(tmp_path: Path, capsys: pytest.Capt
     cells = study.line(row)
     assert len(cells) == len(study._HEAD) and cells[0] == "watermelon"
     assert "| 8 |" in study.seeds_table([row])
+    assert study.main([*words, "--law", "rankine"]) == 0
+    both = study.read(lines)
+    assert [r["law"] for r in both] == ["nacc", "nacc", "rankine", "rankine"]
+    assert both[2]["broken"] != row["broken"] and study.seeds_table(both).count("\n") == 3
+    assert "rankine" in study.exponents(both)
 
 
 def test_the_account_of_a_fall_adds_up() -> None:
@@ -159,16 +165,38 @@ def test_what_a_point_takes_hangs_on_how_it_was_strained_before() -> None:
         account.energy_of_path(row, alpha, (0.0, 0.0, 0.0), 10)
 
 
+@pytest.mark.parametrize("name", ["fruit.watermelon", "glass"])
+def test_what_a_point_takes_by_rankine_is_its_energy_whichever_way_it_opens(name: str) -> None:
+    account = load_script("study/fracture_account")
+    melon = account.preset_of(name, "rankine")
+    dx = account.SPACINGS[name]
+    row, _, alpha = rows_of(melon, torch.ones(1, dtype=torch.float64), dx)
+    wanted = float(melon.fracture_energy or 0.0) / (BAND_CELLS * dx)
+    for way in (account.OPENED, (1.0, -0.3, -0.3), (1.0, -0.4, 0.0)):
+        found = account.energy_of_path(row, alpha, way, 400)
+        assert found == pytest.approx(wanted, rel=0.06), way
+
+
+def test_the_account_by_rankine_tells_opening_from_sliding() -> None:
+    account = load_script("study/fracture_account")
+    trial = dataclasses.replace(account.MELON, height=2.0, law="rankine")
+    row = account.study(trial, 8, 0)
+    parts = [row[name] for name in ("relaxed", "torn", "pressed", "yielded")]
+    assert row["law"] == "rankine" and min(parts) > -1e-3 * row["dissipated"]
+    assert 0.75 * row["dissipated"] < sum(parts) < row["dissipated"]
+    # the law itself takes no more than its share of the fracture energy from what broke
+    area = row["broken_volume"] / (BAND_CELLS * row["dx"])
+    assert row["torn"] > 0.25 * 25.0 * area
+
+
 def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
     scene = study.thrown("glass", 3e-4, 1e-4, 8)
     assert len(scene.materials) <= 16 and scene.v[0, 2] < 0.0
     strong = [math.sinh(-m["hardening"] * m["alpha"]) for m in scene.materials]
     assert min(strong) < max(strong)
     row = study.run_bench("watermelon", 3, 3, "cpu")
-    rows = [
-        {**json.loads(json.dumps(row)), "part": "bench", "name": "watermelon", "cells": n}
-        for n in (3, 4)
-    ]
+    row |= {"part": "bench", "name": "watermelon", "law": "nacc"}
+    rows = [{**json.loads(json.dumps(row)), "cells": n} for n in (3, 4)]
     table = study.bench_table(rows)
     assert table.count("watermelon") == 2 and "band" in table
 

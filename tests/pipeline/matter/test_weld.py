@@ -154,13 +154,16 @@ def test_a_weld_changes_no_stress_energy_or_momentum() -> None:
     assert torch.equal(after.particles.affine, state.particles.affine)
 
 
+@pytest.mark.parametrize("cohesion", [None, 2.0, 10.0])
 @pytest.mark.parametrize("share", [0.1, 0.7, 1.0])
-def test_surfaces_are_nested_in_alpha(share: float) -> None:
+def test_surfaces_are_nested_in_alpha(share: float, cohesion: float | None) -> None:
     """A state on the surface of weaker matter lies inside that of stronger matter."""
     generator = torch.Generator().manual_seed(7)
     matter = halves()[0]
     count = 2000
     params = matter.params[:1].double()
+    if cohesion is not None:  # Rankine's surface
+        params[0, 5] = -cohesion
     law = matter.law[:1]
     start = float(matter.particles.alpha[0])
     weak = torch.full((count,), share * start, dtype=torch.float64)
