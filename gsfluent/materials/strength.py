@@ -59,15 +59,16 @@ def opening(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rankine's softening with a given energy per volume.
 
-    ``f = beta kappa sinh(xi |alpha|)`` takes ``beta kappa (cosh(xi |alpha0|) - 1) / xi`` until it is
-    gone, whatever the path. It must fall slower than matter unloads, else the energy is that of the
-    step: then there is less strength, or by ``prefer="strength"`` more energy.
+    ``f = beta kappa sinh(xi |alpha|)`` takes ``beta kappa (cosh(xi |alpha0|) - 1) / xi`` until it
+    is gone, whatever the path. It must fall slower than matter unloads, else the energy is that of
+    the step: then there is less strength, or more energy.
 
     Args:
         kappa: Bulk modulus [Pa], [N].
         young: Young's modulus [Pa], [N].
         tensile: Tensile strength [Pa], [N].
         energy: Energy per volume [J/m^3], [N].
+        prefer: ``toughness`` lowers the strength there, ``strength`` raises the energy.
 
     Returns:
         ``(beta, xi, alpha0, kept)``, [N] each; the last is the share of the strength that is left.

@@ -259,8 +259,8 @@ def return_mapping(
     * 0 ``elastic``: neo-Hookean (Borden); 6 ``corotated``: fixed corotated. Never yield.
     * 1 ``nacc``: ``q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0``,
       ``p0 = kappa (1e-5 + sinh(xi max(-alpha, 0)))``, along the line to the dynamic centre. With
-      ``-c`` for a shear damage: principal stresses up to ``f = beta kappa sinh(xi max(-alpha, 0))``,
-      alpha by what opens, and ``q <= max(c f, M p)``.
+      ``-c`` for a shear damage Rankine's surface: principal stresses up to
+      ``f = beta kappa sinh(xi max(-alpha, 0))``, alpha by what opens, ``q <= max(c f, M p)``.
     * 2 ``drucker_prager``: Hencky elasticity, ``|dev tau| <= 3 alpha_DP (p + c)``, no tension
       beyond ``p = -c``, with volume correction.
     * 3 ``von_mises``: Hencky elasticity, ``|dev tau| <= sqrt(2/3) (sigma_y + H alpha)``; with a
@@ -288,9 +288,9 @@ def return_mapping(
             drucker_prager: alpha_DP, von_mises: yield stress sigma_y [Pa], fluid: viscosity
             [Pa s]); cohesion (nacc: beta, drucker_prager: tensile pressure c [Pa]); hardening
             (nacc: xi, von_mises: modulus H [Pa]); shear damage (nacc: eta, or below zero -c of
-            Rankine's surface; von_mises: plastic viscosity [Pa s]); density [kg/m^3], not used here; exponent (fluid: gamma, 0 means 7;
-            von_mises: n of Johnson and Cook, whose rate factor C is then column 3 and whose heat Q
-            [J/m^3] is column 5).
+            Rankine's surface; von_mises: plastic viscosity [Pa s]); density [kg/m^3], not used
+            here; exponent (fluid: gamma, 0 means 7; von_mises: n of Johnson and Cook, whose rate
+            factor C is then column 3 and whose heat Q [J/m^3] is column 5).
             yeoh: C20 and C30 [Pa] in columns 2 and 3; ogden: alpha_1, mu_2 [Pa], alpha_2, mu_3
             [Pa] in columns 2 to 5, alpha_3 in column 7. phase_field: columns 2 to 5 are the
             threshold psi_t [J/m^3], the damage d, the length l [m], and split (0 volumetric, 1

@@ -23,9 +23,7 @@ NACC = torch.tensor([LAWS["nacc"]], dtype=torch.int32)
 def row(strength: float, energy: float, crushing: float = 5.0, friction: float = 1.5) -> Tensor:
     """Parameters [1, 8] and the alpha they begin with; strength in units of the stiffness."""
     one = torch.ones(1, dtype=torch.float64)
-    beta, xi, alpha0, kept = opening(
-        KAPPA * one, YOUNG * one, strength * YOUNG * one, energy * one
-    )
+    beta, xi, alpha0, kept = opening(KAPPA * one, YOUNG * one, strength * YOUNG * one, energy * one)
     assert float(kept) == 1.0
     columns = (MU, KAPPA, friction, float(beta), float(xi), -crushing, 1000.0, 0.0)
     return torch.tensor([[*columns, float(alpha0)]], dtype=torch.float64)
@@ -132,7 +130,9 @@ def test_a_break_takes_its_energy_whichever_way_it_is_pulled(way: str) -> None:
 def test_the_answer_turns_with_what_is_asked() -> None:
     strain, alpha, step, rows = states(0.05, torch.float64)
     law = NACC.expand(len(alpha)).contiguous()
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).double())[0]
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)).double())[
+        0
+    ]
     turn = turn * torch.linalg.det(turn).sign()
     _, plain, stress, _ = ops.return_mapping(strain, alpha, step, law=law, params=rows)
     _, turned, other, _ = ops.return_mapping(

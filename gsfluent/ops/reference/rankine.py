@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsfluent.ops.reference.nacc import ALPHA_MAX, Material
-from gsfluent.ops.reference.tensors import diagonal, to_matrix, to_sym, unit_det_shift
+from gsfluent.ops.reference.tensors import to_matrix, to_sym, unit_det_shift
 
 STEEPEST = 0.98
 ROUNDS = 40
@@ -17,7 +17,7 @@ SLACK = {torch.float64: 1e-12, torch.float32: 4e-6}
 
 
 def strength(m: Material, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """f and -df/dalpha [Pa], [N]."""
+    """F and -df/dalpha [Pa], [N]."""
     size = m.cohesion * m.kappa
     x = (m.hardening * (-alpha).clamp(min=0.0)).clamp(max=5.0)
     whole = alpha < 0.0
@@ -72,7 +72,7 @@ def _open(
     values, vectors = torch.linalg.eigh(to_matrix(d))
     y, vectors = values.flip(1), vectors.flip(2)
     mean = 0.5 * m.kappa * j2m1
-    f0, slope0 = strength(m, alpha)
+    f0, _ = strength(m, alpha)
     top = m.mu * y[:, 0]
     opens = top + mean > f0 + slack * (f0 + top.abs() + mean.abs())
     trial = 0.5 * torch.log1p((unit_det_shift(d)[:, None] + y).clamp(min=1e-6 - 1.0))
