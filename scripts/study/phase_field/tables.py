@@ -325,14 +325,11 @@ def plan(found: Mapping[str, Found]) -> str:
     worst = max((max(f["momentum"], f["gained"]) for f in balls), default=math.nan)
     worst = worst if all(f["same"] for f in balls) else math.inf
     rows.append(("balls, 20 000 steps", "1e-6, same bits", _met(worst, 1e-6, f"{worst:.0e}")))
-    means = (
-        [
-            float(np.mean([f["first"]["pieces"] for f in of("melon") if f["cells"] == cells]))
-            for cells in sorted({f["cells"] for f in of("melon") if f["height"] == 0.6})
-        ]
-        if all("first" in f for f in of("melon"))
-        else []
-    )
+    melons = [f for f in of("melon") if "first" in f and f["height"] == 0.6]
+    means = [
+        float(np.mean([f["first"]["pieces"] for f in melons if f["cells"] == cells]))
+        for cells in {f["cells"] for f in melons}
+    ]
     off = max(means) / min(means) - 1.0 if len(means) > 2 else math.nan
     rows.append(("melon at 20, 30, 40 cells", "25 %", _met(off, 0.25, f"{100.0 * off:.0f} %")))
     return _table(("row", "bar", "found"), rows)
