@@ -159,7 +159,8 @@ def draw(axis: Any, place: np.ndarray, piece: np.ndarray, name: str) -> None:
     from matplotlib import colormaps
 
     order = np.argsort(place[:, 2])
-    colors = [c for c in colormaps["tab20"].colors if max(c) - min(c) > 0.05]  # no greys
+    every = [colormaps["tab20"](i)[:3] for i in range(20)]
+    colors = [c for c in every if max(c) - min(c) > 0.05]  # no greys
     shade = np.random.default_rng(1).permutation(len(colors))
     color = np.where(piece >= 0, shade[np.maximum(piece, 0) % len(colors)], -1)
     axis.set_facecolor("#1c1c20")
