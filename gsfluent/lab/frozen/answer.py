@@ -13,13 +13,13 @@ import torch
 
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.scenes.rows import BAND_CELLS
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
 from gsfluent.materials import Material, opening, phase_field
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
-from gsfluent.pipeline.matter.crack_band import BAND_CELLS
 
 
 def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
