@@ -201,6 +201,18 @@ def test_a_thrown_ball_is_the_preset_on_its_grid(tmp_path: Path) -> None:
     assert table.count("watermelon") == 2 and "band" in table
 
 
+def test_a_melon_of_another_energy_is_measured_once(tmp_path: Path) -> None:
+    surface = load_script("study/surface/melon")
+    lines = tmp_path / "lines.jsonl"
+    words = ["-o", str(lines), "--law", "rankine", "--energy", "60", "--cells", "8"]
+    assert surface.main(words) == 0 and surface.main(words) == 0
+    (row,) = study.read(lines)
+    assert (row["law"], row["gc"], row["height"], row["cells"]) == ("rankine", 60.0, 2.0, 8)
+    assert row["blocks"] > 1.0 and row["broken"] > 0.0
+    trial = surface.Melon(study.MELON.material, study.MELON.half, 0.2, energy=60.0)
+    assert trial.matter.fracture_energy == trial.matter.parts[0]["fracture_energy"] == 60.0
+
+
 def test_an_unknown_part_is_named() -> None:
     with pytest.raises(SystemExit, match="dorp"):
         study.main(["--only", "dorp", "--estimate"])

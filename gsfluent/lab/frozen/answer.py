@@ -13,6 +13,7 @@ import torch
 
 from gsfluent.fracturebench.run import Run
 from gsfluent.fracturebench.scene import Scene
+from gsfluent.fracturebench.scenes.rows import BAND_CELLS
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
