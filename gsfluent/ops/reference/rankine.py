@@ -13,6 +13,7 @@ from gsfluent.ops.reference.tensors import to_matrix, to_sym, unit_det_shift
 
 STEEPEST = 0.98
 ROUNDS = 40
+TINY = 1e-30
 SLACK = {torch.float64: 1e-12, torch.float32: 4e-6}
 
 
@@ -69,8 +70,12 @@ def _open(
     d: Tensor, j2m1: Tensor, alpha: Tensor, m: Material, softens: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     slack = SLACK[d.dtype]
-    values, vectors = torch.linalg.eigh(to_matrix(d))
-    y, vectors = values.flip(1), vectors.flip(2)
+    matrix = to_matrix(d)
+    none_left = (matrix.abs().amax(dim=(1, 2)) < TINY)[:, None]
+    # directions of nothing have no gradient: any others will do
+    apart = torch.diag(torch.tensor([-1.0, 0.0, 1.0], dtype=d.dtype, device=d.device))
+    values, vectors = torch.linalg.eigh(torch.where(none_left[:, None], apart, matrix))
+    y, vectors = torch.where(none_left, 0.0, values.flip(1)), vectors.flip(2)
     mean = 0.5 * m.kappa * j2m1
     f0, _ = strength(m, alpha)
     top = m.mu * y[:, 0]

@@ -315,11 +315,7 @@ def plan(found: Mapping[str, Found]) -> str:
     if len(plates) > 1:
         finest = max(plates, key=lambda f: (f["length_mm"], f["points"]))
         line = np.array(finest["path"]) / 1e3
-        gap = 1e3 * max(
-            apart(np.array(f["path"]) / 1e3, line)
-            for f in plates
-            if f["length_mm"] == finest["length_mm"]
-        )
+        gap = 1e3 * max(apart(np.array(f["path"]) / 1e3, line) for f in plates if f is not finest)
     rows.append(("compact compression, by `rankine`", "2 mm", _met(gap, 2.0, f"{gap:.1f} mm")))
     balls = of("floor")
     worst = max((max(f["momentum"], f["gained"]) for f in balls), default=math.nan)
