@@ -30,7 +30,8 @@ from gsfluent.lab.charts.run_case import ANSWER, Question, answer_task
 from gsfluent.sweep.engine import map as sweep_map
 
 METHODS = {
-    "named": "gsfluent", "nacc": "gsfluent nacc", "phase_field": "gsfluent phase field",
+    "named": "gsfluent", "nacc": "gsfluent nacc", "rankine": "gsfluent rankine",
+    "phase_field": "gsfluent phase field",
 }  # fmt: skip
 """Names of gsfluent's laws of breaking in the table."""
 QUICK = ("bar", "two_material_bar", "pull_apart", "covariance_transport", "oblique")

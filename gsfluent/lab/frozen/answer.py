@@ -17,7 +17,7 @@ from gsfluent.fracturebench.scenes.rows import BAND_CELLS
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
 from gsfluent.lab.world.shapes import parameters
-from gsfluent.materials import Material, phase_field
+from gsfluent.materials import Material, opening, phase_field
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
 
@@ -44,16 +44,42 @@ def _phase_field(m: Mapping[str, Any], dx: float) -> torch.Tensor:
     return phase_field.rows(material, at, torch.ones(1, dtype=torch.float64), dx)[0]
 
 
+def _rankine(m: Mapping[str, Any], dx: float) -> tuple[dict[str, float], float]:
+    """Columns of a brittle row by Rankine's surface, and its alpha0.
+
+    Strength and fracture energy are those that the row states; in compression it holds what its
+    ellipse does in one axis.
+    """
+    young, nu = float(m["young_modulus"]), float(m["poisson_ratio"])
+    kappa = young / (3.0 * (1.0 - 2.0 * nu))
+    slope, beta = float(m["friction"]), float(m["cohesion"])
+    tensile = float(m["tensile_strength"])
+    p0 = kappa * math.sinh(-float(m["hardening"]) * float(m["alpha"]))
+    # q = 3 p on q^2 (1 + 2 beta) + M^2 (p + beta p0)(p - p0) = 0
+    a = 9.0 * (1.0 + 2.0 * beta) + slope**2
+    b, c = slope**2 * (beta - 1.0) * p0, -(slope**2) * beta * p0**2
+    compressive = 3.0 * (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
+    energy = float(m["fracture_energy"]) / (BAND_CELLS * dx)
+    numbers = (torch.tensor([v], dtype=torch.float64) for v in (kappa, young, tensile, energy))
+    found, xi, alpha0, _ = opening(*numbers)
+    columns = {
+        "c2": slope, "c3": float(found), "c4": float(xi), "c5": -max(compressive / tensile, 1.0),
+    }  # fmt: skip
+    return columns, float(alpha0)
+
+
 def law_of(m: Mapping[str, Any], law: str = "nacc") -> str:
     """The law by which a material of a scene moves.
 
     Args:
         m: The material.
-        law: Of what breaks: ``nacc``, ``phase_field``, or ``named``: the phase field for what names
-            the width of its cracks (``length``), NACC for what does not.
+        law: Of what breaks: ``nacc``, ``rankine`` (NACC with that surface), ``phase_field``, or
+            ``named``: the phase field for what names the width of its cracks (``length``), NACC
+            for what does not.
     """
     named = "phase_field" if "length" in m else "nacc"
-    return str(m["law"]) if m["law"] != "nacc" else named if law == "named" else law
+    found = {"named": named, "rankine": "nacc"}.get(law, law)
+    return found if m["law"] == "nacc" else str(m["law"])
 
 
 def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -80,12 +106,15 @@ def rows(scene: Scene, law: str = "nacc") -> tuple[torch.Tensor, torch.Tensor, t
             if nacc
             else {}
         )  # fmt: skip
+        first = float(m.get("alpha", 0.0)) if nacc else 0.0
+        if nacc and law == "rankine":
+            columns, first = _rankine(m, scene.dx)
         params.append(
             parameters(
                 float(m["young_modulus"]), float(m["poisson_ratio"]), float(m["density"]), **columns
             )
         )
-        alpha.append(float(m.get("alpha", 0.0)) if nacc else 0.0)
+        alpha.append(first)
     start = torch.tensor(alpha, dtype=torch.float64)[torch.from_numpy(scene.material).long()]
     return torch.tensor(laws, dtype=torch.int32), torch.stack(params), start
 
