@@ -110,7 +110,7 @@ def test_a_break_takes_its_energy_whichever_way_it_is_pulled(way: str) -> None:
     table = row(strength, energy, crushing=50.0, friction=50.0)  # nothing slides
     rows, alpha = table[:, :8].contiguous(), table[:, 8].contiguous()
     strain = torch.zeros(1, 6, dtype=torch.float64)
-    stress, work, steps = torch.zeros(1, 6, dtype=torch.float64), 0.0, 4000
+    stress, work, steps = torch.zeros(1, 6, dtype=torch.float64), 0.0, 800
     start, size = float(alpha), -float(alpha) / steps
     direction = torch.tensor(WAYS[way], dtype=torch.float64)
     for _ in range(12 * steps):
@@ -178,7 +178,7 @@ def test_pressed_matter_holds_its_compressive_strength_and_slides_when_broken() 
 
 
 def test_gradients_follow_the_definition() -> None:
-    strain, alpha, step, rows = (v[:12].clone() for v in states(0.05, torch.float64))
+    strain, alpha, step, rows = (v[4:6].clone() for v in states(0.05, torch.float64))
     law = NACC.expand(len(alpha)).contiguous()
     strain, alpha, step = (v.requires_grad_() for v in (strain, alpha, step))
 
