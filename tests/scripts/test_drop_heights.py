@@ -47,7 +47,8 @@ def test_a_tiny_ball_from_end_to_end(
     assert row["low"] <= row["height"] <= row["high"]
     assert row["mass"] == pytest.approx(math.pi / 6 * 0.1**3 * 1000.0, rel=0.05)
     text = page.read_text()
-    assert text.startswith("# Drops\n\nwords\n") and text.count("| plaster ball | nacc | 1/100 |") == 1
+    assert text.startswith("# Drops\n\nwords\n")
+    assert text.count("| plaster ball | nacc | 1/100 |") == 1
     # what is there is not run again
     monkeypatch.setattr(drops, "study", lambda *_: pytest.fail("run again"))
     assert drops.main(given) == 0 and page.read_text() == text
