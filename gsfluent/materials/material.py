@@ -55,7 +55,8 @@ SHEAR = 0.03
 and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
 is whole, with 0.5 it is crushed)."""
 _PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness", "hysteresis": "pressed"}
-_ELLIPSE = {"surface": "cam_clay"}
+_OPENED = (*DERIVED, "shear_damage")
+"""What the strengths and the energy fix on Rankine's surface."""
 """What only brittle matter reads, as it is in other matter."""
 _PLAIN_FIELD = {"split": "volumetric", "model": "at1"}
 """What only phase_field reads."""
@@ -258,11 +259,11 @@ class Material:
             )
         by_handbook = not missing
         if self.surface == "rankine":
-            by_hand = [f for f in (*DERIVED, "shear_damage") if getattr(self, f) is not None]
+            by_hand = [f for f in _OPENED if getattr(self, f) is not None]
             if self.law != "nacc" or missing or by_hand:
                 raise InputError(
                     f"material {self.name!r}: surface 'rankine' takes law 'nacc' with "
-                    f"{', '.join(HANDBOOK)}, and none of {', '.join(DERIVED)}, shear_damage",
+                    f"{', '.join(HANDBOOK)}, and none of {', '.join(_OPENED)}",
                     hint="take 'cam_clay' to give them by hand",
                 )
         for field, (low, high, unit) in RANGES.items():
@@ -356,7 +357,7 @@ class Material:
             if law not in BREAKS:
                 changes = {**_PLAIN, **changes}
             if law != "nacc":  # what parts change are parameters of nacc
-                changes = {"parts": (), **_ELLIPSE, **changes}
+                changes = {"parts": (), "surface": "cam_clay", **changes}
             if law == "phase_field" and self.fracture_energy is not None:
                 changes = {"toughness": self.fracture_energy, **changes}
             else:
@@ -366,7 +367,7 @@ class Material:
         ):
             changes = {"hysteresis": "pressed", "relaxation_time": None, **changes}
         if changes.get("surface") == "rankine":
-            changes = {**dict.fromkeys((*DERIVED, "shear_damage")), **changes}
+            changes = {**dict.fromkeys(_OPENED), **changes}
         if "variation" in changes:
             changes = {"weibull_modulus": 0.0, **changes}
         changes = self._softened(changes)
@@ -511,15 +512,14 @@ class Material:
         if len(given) == len(DERIVED):
             return given
         none = torch.zeros((), dtype=torch.float64)
-        open_yet = (*DERIVED, "shear_damage") if self.surface == "rankine" else DERIVED
+        open_yet = _OPENED if self.surface == "rankine" else DERIVED
         plain = laws.row("nacc", lambda f: none if f in open_yet else self._at(f, at))
         kappa = plain[..., 1]
         tensile, compressive = torch.broadcast_tensors(*self.strengths(at), kappa)[:2]
         if self.surface == "rankine":
-            young = 9.0 * kappa * plain[..., 0] / (3.0 * kappa + plain[..., 0])
-            beta, hardening, alpha0, _ = opening(
-                kappa, young, tensile, torch.zeros_like(tensile), prefer="strength"
-            )
+            none = torch.zeros_like(tensile)
+            mu = plain[..., 0]
+            beta, hardening, alpha0, _ = opening(mu, kappa, tensile, none, prefer="strength")
             found = {"cohesion": beta, "hardening": hardening, "alpha0": alpha0}
             return found | {"shear_damage": -compressive / tensile}
         beta, p0 = ellipse(plain[..., 2], tensile, compressive, LARGEST * kappa)

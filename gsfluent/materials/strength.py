@@ -55,7 +55,7 @@ SHAPE = 0.25
 
 
 def opening(
-    kappa: Tensor, young: Tensor, tensile: Tensor, energy: Tensor, *, prefer: str = "toughness"
+    mu: Tensor, kappa: Tensor, tensile: Tensor, energy: Tensor, *, prefer: str = "toughness"
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rankine's softening with a given energy per volume.
 
@@ -64,8 +64,8 @@ def opening(
     the step: then there is less strength, or more energy.
 
     Args:
+        mu: Shear modulus [Pa], [N].
         kappa: Bulk modulus [Pa], [N].
-        young: Young's modulus [Pa], [N].
         tensile: Tensile strength [Pa], [N].
         energy: Energy per volume [J/m^3], [N].
         prefer: ``toughness`` lowers the strength there, ``strength`` raises the energy.
@@ -73,6 +73,7 @@ def opening(
     Returns:
         ``(beta, xi, alpha0, kept)``, [N] each; the last is the share of the strength that is left.
     """
+    young = 9.0 * kappa * mu / (3.0 * kappa + mu)
     steepest = STEEPEST * torch.minimum(kappa, young)
     cosh, sinh = math.cosh(SHAPE), math.sinh(SHAPE)
     # -df/dalpha at the start is beta kappa xi cosh = (f / sinh)^2 (cosh - 1) cosh / energy

@@ -27,12 +27,10 @@ from typing import Any
 
 import torch
 from fracture_resolution import LINES, MELON, PAGE, Trial, link_area
-from rows import NAMES, Row, add_law, append, law_of, numbers, preset_of, read, table
+from rows import NAMES, Row, add_law, append, law_of, numbers, preset_of, put, read, table
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.figure.markdown import enter
-from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import machine
 from gsfluent.lab.problems.fracture.energy import rows_of
 from gsfluent.ops.plasticity import LAWS
@@ -337,13 +335,6 @@ def page_table(rows: list[dict[str, Any]]) -> str:
     return table(head, out)
 
 
-def put(name: str, text: str) -> None:
-    """Enter a table into the page."""
-    page = enter(PAGE.read_text(encoding="utf-8"), name, text)
-    with atomic_path(PAGE) as file:
-        file.write_text(page, encoding="utf-8")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run it."""
     parser = argparse.ArgumentParser(
@@ -358,7 +349,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--paths", action="store_true", help="only the table of paths")
     args = parser.parse_args(argv)
     if args.paths:
-        put("fracture resolution paths", paths_table([args.law] if args.law else NAMES))
+        put(PAGE, "fracture resolution paths", paths_table([args.law] if args.law else NAMES))
         return 0
     keys = ("law", "height", "cells", "seed", "device")
     done = {tuple(r[k] for k in keys) for r in read(args.out)}
@@ -372,7 +363,7 @@ def main(argv: list[str] | None = None) -> int:
                 sys.stderr.write(f"{json.dumps(row)}\n")
                 append(args.out, row)
     if args.out == OUT:
-        put("fracture resolution account", page_table(read(args.out)))
+        put(PAGE, "fracture resolution account", page_table(read(args.out)))
     return 0
 
 

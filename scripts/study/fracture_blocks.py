@@ -21,12 +21,10 @@ from typing import Any
 
 import torch
 from fracture_resolution import DROPS, LINES, PAGE, Trial
-from rows import Row, add_law, append, law_of, numbers, read, table
+from rows import Row, add_law, append, law_of, numbers, put, read, table
 from torch import Tensor
 
 from gsfluent import ops
-from gsfluent.figure.markdown import enter
-from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import commit, machine
 from gsfluent.pipeline.matter.pieces import LEAST
 from gsfluent.pipeline.simulate.groups import grid_mask
@@ -143,9 +141,7 @@ def page(rows: list[Row]) -> None:
         ]
         for r in sorted(rows, key=lambda r: (r["device"], r["law"], r["cells"]))
     ]  # fmt: skip
-    text = enter(PAGE.read_text(encoding="utf-8"), "fracture resolution blocks", table(head, lines))
-    with atomic_path(PAGE) as file:
-        file.write_text(text, encoding="utf-8")
+    put(PAGE, "fracture resolution blocks", table(head, lines))
 
 
 def main(argv: list[str] | None = None) -> int:

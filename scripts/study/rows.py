@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gsfluent import materials
+from gsfluent.figure.markdown import enter
+from gsfluent.io.atomic import atomic_path
 from gsfluent.materials import Material
 
 Row = dict[str, Any]
@@ -71,6 +73,13 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [f"| {' | '.join(head)} |", "|" + " --- |" * len(head)]
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def put(page: Path, name: str, text: str) -> None:
+    """Enter a text into a page, between the marks of that name."""
+    whole = enter(page.read_text(encoding="utf-8"), name, text)
+    with atomic_path(page) as file:
+        file.write_text(whole, encoding="utf-8")
 
 
 def numbers(text: str) -> tuple[int, ...]:

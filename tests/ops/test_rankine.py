@@ -23,7 +23,7 @@ NACC = torch.tensor([LAWS["nacc"]], dtype=torch.int32)
 def row(strength: float, energy: float, crushing: float = 5.0, friction: float = 1.5) -> Tensor:
     """Parameters [1, 8] and the alpha they begin with; strength in units of the stiffness."""
     one = torch.ones(1, dtype=torch.float64)
-    beta, xi, alpha0, kept = opening(KAPPA * one, YOUNG * one, strength * YOUNG * one, energy * one)
+    beta, xi, alpha0, kept = opening(MU * one, KAPPA * one, strength * YOUNG * one, energy * one)
     assert float(kept) == 1.0
     columns = (MU, KAPPA, friction, float(beta), float(xi), -crushing, 1000.0, 0.0)
     return torch.tensor([[*columns, float(alpha0)]], dtype=torch.float64)

@@ -51,7 +51,7 @@ def _rankine(m: Mapping[str, Any], dx: float) -> tuple[dict[str, float], float]:
     ellipse does in one axis.
     """
     young, nu = float(m["young_modulus"]), float(m["poisson_ratio"])
-    kappa = young / (3.0 * (1.0 - 2.0 * nu))
+    mu, kappa = young / (2.0 * (1.0 + nu)), young / (3.0 * (1.0 - 2.0 * nu))
     slope, beta = float(m["friction"]), float(m["cohesion"])
     tensile = float(m["tensile_strength"])
     p0 = kappa * math.sinh(-float(m["hardening"]) * float(m["alpha"]))
@@ -60,7 +60,7 @@ def _rankine(m: Mapping[str, Any], dx: float) -> tuple[dict[str, float], float]:
     b, c = slope**2 * (beta - 1.0) * p0, -(slope**2) * beta * p0**2
     compressive = 3.0 * (-b + math.sqrt(b * b - 4.0 * a * c)) / (2.0 * a)
     energy = float(m["fracture_energy"]) / (BAND_CELLS * dx)
-    numbers = (torch.tensor([v], dtype=torch.float64) for v in (kappa, young, tensile, energy))
+    numbers = (torch.tensor([v], dtype=torch.float64) for v in (mu, kappa, tensile, energy))
     found, xi, alpha0, _ = opening(*numbers)
     columns = {
         "c2": slope, "c3": float(found), "c4": float(xi), "c5": -max(compressive / tensile, 1.0),

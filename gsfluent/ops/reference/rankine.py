@@ -18,7 +18,7 @@ SLACK = {torch.float64: 1e-12, torch.float32: 4e-6}
 
 
 def strength(m: Material, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """F and -df/dalpha [Pa], [N]."""
+    """Strength f and -df/dalpha [Pa], [N]."""
     size = m.cohesion * m.kappa
     x = (m.hardening * (-alpha).clamp(min=0.0)).clamp(max=5.0)
     whole = alpha < 0.0
@@ -132,6 +132,5 @@ def rankine(
         alpha = torch.where(closes, alpha - closing, alpha)
     d, slid = _slide(d, j2m1, alpha, m)
     d, j2m1, alpha, opened = _open(d, j2m1, alpha, m, softens)
-    again, late = _slide(d, j2m1, alpha, m)
-    d = torch.where(opened[:, None], again, d)
-    return d, j2m1, alpha, closes | slid | opened | (opened & late)
+    d = torch.where(opened[:, None], _slide(d, j2m1, alpha, m)[0], d)
+    return d, j2m1, alpha, closes | slid | opened

@@ -118,8 +118,7 @@ def _opening(
     """What :func:`gsfluent.materials.opening` says of rows on a grid, [M] each."""
     mu, kappa, beta, xi = (rows[:, column] for column in (0, 1, 3, 4))
     tensile = beta * kappa * torch.sinh(xi * alpha0.abs()) * weakness
-    young = 9.0 * kappa * mu / (3.0 * kappa + mu)
-    return opening(kappa, young, tensile, energy / (BAND_CELLS * dx), prefer=material.prefer)
+    return opening(mu, kappa, tensile, energy / (BAND_CELLS * dx), prefer=material.prefer)
 
 
 def softened(

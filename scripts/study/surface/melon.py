@@ -18,10 +18,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from fracture_resolution import LINES, MELON, PAGE, Trial, exponent, run_trial
-from rows import Row, add_law, append, law_of, numbers, preset_of, read, table
+from rows import Row, add_law, append, law_of, numbers, preset_of, put, read, table
 
-from gsfluent.figure.markdown import enter
-from gsfluent.io.atomic import atomic_path
 from gsfluent.lab.charts.record import commit, machine
 from gsfluent.materials import Material
 
@@ -70,9 +68,7 @@ def page(rows: list[Row]) -> None:
     words = f"Power of dx with which what breaks falls: {'; '.join(said)}."
     devices = ", ".join(sorted({r["device"] for r in rows}))
     text = f"{table(head, lines)}\n\n{words} Devices: {devices}."
-    text = enter(PAGE.read_text(encoding="utf-8"), "fracture resolution surfaces", text)
-    with atomic_path(PAGE) as file:
-        file.write_text(text, encoding="utf-8")
+    put(PAGE, "fracture resolution surfaces", text)
 
 
 def main(argv: list[str] | None = None) -> int:
