@@ -33,14 +33,14 @@ def rows_between(ordered: Tensor, low: Tensor, high: Tensor, share: Tensor) -> T
     """
     op = "rows_between"
     check_tensor(op, "ordered", ordered, shape=("P", "L", "D"), dtype=torch.float32)
-    shape = (ordered.shape[0], None)
+    shape: tuple[int | None, ...] = (ordered.shape[0], None)
     for name, value, dtype in (
         ("low", low, torch.int64),
         ("high", high, torch.int64),
         ("share", share, torch.float32),
     ):
         check_tensor(op, name, value, shape=shape, dtype=dtype, like=ordered)
-        shape = low.shape
+        shape = tuple(low.shape)
     found: Tensor = torch.ops.gsfluent.rows_between.default(ordered, low, high, share)
     return found
 
