@@ -200,7 +200,7 @@ struct SolverOps {
         {"damage_nodes", c * kBlockNodes, kDamageSums, ScalarType::Double, true},
         {"damage_slots", kDamagePlanes, c, i32, true},
         {"damage_homes", h, 1, i32, true},
-        {"damage_counts", 3, 1, i32, true},
+        {"damage_counts", 4, 1, i32, true},
         {"damage_scale", kDamageSums + 2, 1, ScalarType::Double, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {

@@ -179,7 +179,7 @@ class Buffers:
                 self.damage_sums = torch.zeros_like(self.sums)
                 self.damage_nodes = torch.zeros_like(self.sums, dtype=torch.float64)
                 self.damage_slots, self.damage_homes = whole(DAMAGE_PLANES, slots), whole(homes)
-                self.damage_counts = whole(3)
+                self.damage_counts = whole(4)
         # Homes and slots share the table with one entry per site; half full at most.
         entries = 1 << max(10, (4 * slots - 1).bit_length())
         if self.peers.numel():

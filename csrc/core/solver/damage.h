@@ -22,7 +22,7 @@ inline constexpr int kDamageSum = 0, kDriveSum = 1, kStiffSum = 2, kVolumeSum = 
 // which it takes part, the lists of both, and the slots beyond the faces or what stands there.
 enum DamagePlane : int { kHotPlane, kActivePlane, kHotList, kActiveList, kFaces };
 inline constexpr int kDamagePlanes = kFaces + 6;
-enum DamageCount : int { kHotCount, kActiveCount, kHomeCount };
+enum DamageCount : int { kHotCount, kActiveCount, kHomeCount, kNextHome };
 // Of SolverView::damage_scale, after the units of the sums.
 inline constexpr int kScaleAt2 = kDamageSums, kScaleEmpty = kDamageSums + 1;
 enum DamageFace : int32_t { kNoBlock = -1, kUndamaged = -2 };

@@ -256,7 +256,8 @@ struct SolverView {
   double* damage_nodes;    // [S, 64, 4] DamageNode
   int32_t* damage_slots;   // [kDamagePlanes, S]
   int32_t* damage_homes;   // [H] homes that meet slots that take part
-  int32_t* damage_counts;  // [3] slots of points to solve for, slots that take part, such homes
+  int32_t* damage_counts;  // [4] slots of points to solve for, slots that take part, such homes,
+                           // homes that are taken
   double* damage_scale;    // [6] units of the sums, 1 of AT2, volume of an empty node
 
   // Whether this rank answers for a slot: counts its contacts, books its impulses. The first does

@@ -18,6 +18,27 @@ namespace {
 
 // Threads of a CTA, of which each multiprocessor runs one: half of its registers are left to p2g.
 constexpr int kDamageThreads = 512, kDamageShare = 2;
+// Groups of a CTA, each of which takes a home after the other: while one waits for memory or for
+// its last thread, the others add. By one home a CTA at a time the sums of points took 2.2 times as
+// long as the relaxation (H200).
+constexpr int kGroups = 4, kGroupThreads = kDamageThreads / kGroups;
+
+struct Group {
+  int index, thread;
+
+  // A barrier named by a variable would take all sixteen of a CTA.
+  __device__ void sync() const {
+    static_assert(kGroups == 4 && kGroupThreads == 128);
+    if (index == 0)
+      asm volatile("bar.sync 1, 128;" ::: "memory");
+    else if (index == 1)
+      asm volatile("bar.sync 2, 128;" ::: "memory");
+    else if (index == 2)
+      asm volatile("bar.sync 3, 128;" ::: "memory");
+    else
+      asm volatile("bar.sync 4, 128;" ::: "memory");
+  }
+};
 
 // Sums of a window in shared memory. There the GPU adds 32 bits at once, but 64 in a loop. In
 // float, whose units leave 41 bits to a point (ops/solver_state.py), each sum has two words. The
@@ -67,6 +88,10 @@ struct DamageTile<double> {
   }
   __device__ long long sum(int c, int at) const { return static_cast<long long>(words[c][at]); }
 };
+
+template <typename T>
+constexpr int kTileBytes = kGroups * static_cast<int>(sizeof(DamageTile<T>));
+static_assert(sizeof(DamageTile<double>) >= kTile * sizeof(double));
 
 // Of the 27 blocks around a home, those that the stencil of a point touches.
 __device__ uint32_t blocks_touched(uint32_t meta) {
@@ -130,9 +155,24 @@ struct Solve {
     return inside ? slot : plane(kFaces + f)[slot];
   }
 
+  // Homes that nobody has taken yet go to the next group that asks. The same for all its threads.
+  template <typename F>
+  __device__ void for_homes(const Group& group, const F& f) const {
+    __shared__ int next[kGroups];
+    const int homes = s.damage_counts[kHomeCount];
+    for (;;) {
+      if (group.thread == 0) next[group.index] = atomicAdd(s.damage_counts + kNextHome, 1);
+      group.sync();
+      const int i = next[group.index];
+      group.sync();
+      if (i >= homes) return;
+      f(s.damage_homes[i]);
+    }
+  }
+
   // Slots of points to solve for and those around them.
   __device__ void spread() const {
-    if (thread == 0) s.damage_counts[kHomeCount] = 0;
+    if (thread == 0) s.damage_counts[kHomeCount] = s.damage_counts[kNextHome] = 0;
     const int64_t work = int64_t(s.damage_counts[kHotCount]) * kNeighbours;
     for (int64_t i = thread; i < work; i += threads) {
       const int64_t hot = plane(kHotList)[i / kNeighbours];
@@ -168,8 +208,8 @@ struct Solve {
     }
   }
 
-  // Sums of the points of one home, by a CTA.
-  __device__ void scatter(int64_t home, DamageTile<T>& tile) const {
+  // Sums of the points of one home, by a group.
+  __device__ void scatter(int64_t home, const Group& group, DamageTile<T>& tile) const {
     const int32_t* neighbour = s.neighbour + home * kNeighbours;
     const int lane = static_cast<int>(threadIdx.x & 31u);
     const uint32_t wanted = __ballot_sync(kAllLanes, lane < kNeighbours && active(neighbour[lane]));
@@ -179,13 +219,13 @@ struct Solve {
     double per_unit[kDamageSums];
     for (int c = 0; c < kDamageSums; ++c) per_unit[c] = 1.0 / s.damage_scale[c];
     for (int64_t begin = 0; begin < count; begin += kChunk) {
-      tile.clear(static_cast<int>(threadIdx.x), kDamageThreads);
-      __syncthreads();
+      tile.clear(group.thread, kGroupThreads);
+      group.sync();
       const int64_t end = min(begin + int64_t(kChunk), count);
-      for (int64_t r = begin + threadIdx.x; r < end; r += kDamageThreads)
+      for (int64_t r = begin + group.thread; r < end; r += kGroupThreads)
         give(first + r, wanted, per_unit, tile);
-      __syncthreads();
-      for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
+      group.sync();
+      for (int index = group.thread; index < kWindowNodes; index += kGroupThreads) {
         int i, j, k;
         const int at = window_node(index, i, j, k);
         if ((wanted >> neighbour_of(i, j, k) & 1u) == 0) continue;
@@ -193,7 +233,7 @@ struct Solve {
         for (int c = 0; c < kDamageSums; ++c)
           if (const long long v = tile.sum(c, at); v != 0) add_units(sums + c, v);
       }
-      __syncthreads();
+      group.sync();
     }
   }
   __device__ void give(int64_t p, uint32_t wanted, const double (&per_unit)[kDamageSums],
@@ -315,22 +355,20 @@ struct Solve {
   }
 
   // The field back to the points of one home, by a CTA.
-  __device__ void gather(int64_t home, T (&tile)[kTile]) const {
+  __device__ void gather(int64_t home, const Group& group, T* tile) const {
     const int32_t* neighbour = s.neighbour + home * kNeighbours;
-    bool any = false;
-    for (int index = threadIdx.x; index < kWindowNodes; index += kDamageThreads) {
+    for (int index = group.thread; index < kWindowNodes; index += kGroupThreads) {
       int i, j, k;
       const int at = window_node(index, i, j, k);
       const int32_t slot = neighbour[neighbour_of(i, j, k)];
       const int local = local_index(window_local(i), window_local(j), window_local(k));
       tile[at] = active(slot) ? T(nodes(slot)[local].value) : T(0);
-      any = any || tile[at] != T(0);
     }
-    if (!__syncthreads_or(any)) return;  // no point gets more than it has
+    group.sync();
     const HomeList<T>& homes = s.homes();
     const int64_t first = homes.start[home];
     const int64_t count = min(int64_t(homes.count[home]), s.count - first);
-    for (int64_t r = threadIdx.x; first >= 0 && r < count; r += kDamageThreads) {
+    for (int64_t r = group.thread; first >= 0 && r < count; r += kGroupThreads) {
       const int64_t p = first + r;
       T offset[3];
       const uint32_t meta = load_place(s, p, offset);
@@ -355,8 +393,10 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageShare)
     damage_kernel(const __grid_constant__ SolverView<T> s) {
   // The same for all CTAs: nobody writes these before all have come to the first wait.
   if (!may_step(*s.clock) || s.damage_counts[kHotCount] == 0) return;
-  __shared__ DamageTile<T> sums;
-  __shared__ T field[kTile];
+  extern __shared__ __align__(16) char shared[];
+  DamageTile<T>* tiles = reinterpret_cast<DamageTile<T>*>(shared);
+  const Group group{static_cast<int>(threadIdx.x) / kGroupThreads,
+                    static_cast<int>(threadIdx.x) % kGroupThreads};
   const cooperative_groups::grid_group all = cooperative_groups::this_grid();
   const Solve<T> solve{s, damage_stamp(s.clock->step),
                        int64_t(blockIdx.x) * kDamageThreads + threadIdx.x,
@@ -365,9 +405,9 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageShare)
   all.sync();
   solve.list();
   all.sync();
-  const int64_t homes = s.damage_counts[kHomeCount];
-  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) solve.scatter(s.damage_homes[i], sums);
+  solve.for_homes(group, [&](int64_t home) { solve.scatter(home, group, tiles[group.index]); });
   all.sync();
+  if (solve.thread == 0) s.damage_counts[kNextHome] = 0;
   if (int64_t(s.damage_counts[kActiveCount]) * kBlockNodes <= solve.threads) {
     solve.solve_held(all);
   } else {
@@ -379,10 +419,8 @@ __global__ void __launch_bounds__(kDamageThreads, kDamageShare)
   }
   all.sync();
   if (solve.thread == 0) s.damage_counts[kActiveCount] = 0;
-  for (int64_t i = blockIdx.x; i < homes; i += gridDim.x) {
-    solve.gather(s.damage_homes[i], field);
-    __syncthreads();
-  }
+  T* field = reinterpret_cast<T*>(tiles + group.index);
+  solve.for_homes(group, [&](int64_t home) { solve.gather(home, group, field); });
 }
 
 // A stream beside that of a step, ahead of it where both want a multiprocessor, and the events at
@@ -407,6 +445,8 @@ struct Beside {
       cudaStreamCreateWithPriority(&b.stream, cudaStreamNonBlocking, greatest);
       cudaEventCreateWithFlags(&b.parted, cudaEventDisableTiming);
       cudaEventCreateWithFlags(&b.done, cudaEventDisableTiming);
+      cudaFuncSetAttribute(damage_kernel<T>, cudaFuncAttributeMaxDynamicSharedMemorySize,
+                           kTileBytes<T>);
     }
     return b;
   }
@@ -438,6 +478,7 @@ void solver_damage_begin(const SolverView<T>& s, cudaStream_t stream) {
   cudaLaunchConfig_t config{};
   config.gridDim = dim3(min(homes, static_cast<unsigned>(processors)));
   config.blockDim = dim3(kDamageThreads);
+  config.dynamicSmemBytes = kTileBytes<T>;
   config.stream = beside.stream;
   config.attrs = &together;
   config.numAttrs = 1;

@@ -1,13 +1,12 @@
 """Three-point bending by finite elements: what the beam of the study is held against.
 
-    python scripts/study/phase_field/elements.py OUT [--fine 0.03] [--steps 40] [--blunt 0.09]
+    python scripts/study/phase_field/elements.py OUT [--dx 0.02] [--fine 0.03] [--steps 40]
 
 The beam of :func:`cases.bending`: 8 x 2 mm in plane strain, notch of 0.4 mm, AT2 without a split,
 l 0.06 mm. Bilinear squares, small strains, forces and damage solved in turn until neither moves,
 history as Miehe's. A crack through elements costs 1 + fine / 2 l of Gc, so they work with that
-much less. By --blunt the notch is that wide and what bears the beam touches it by edges a width of
-0.15 mm apart, as on the grid of the study. Leaves bending_elements*.json in OUT, which run.py
---enter reads.
+much less. By --dx the notch is three cells of the study's grid wide, and what bears the beam touches
+it by edges four cells apart. Leaves bending_elements*.json in OUT, which run.py --enter reads.
 """
 
 from __future__ import annotations
@@ -29,25 +28,32 @@ from gsfluent.lab.charts.record import machine
 
 Floats = NDArray[np.float64]
 WIDE, HIGH, DEEP, LENGTH = 8e-3, 2e-3, 4e-4, 6e-5
-PAD = 7.5e-5  # half the width of the bars that bear the beam of the study
+NOTCH, BAR = 3.0, 4.0  # cells of the study's grid between what is cut, and outer nodes of a bar
 RESIDUAL = 1e-4
 GAUSS = [np.array(p) / np.sqrt(3.0) for p in itertools.product((-1.0, 1.0), repeat=2)]
 CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 
 
-def lines(fine: float, bears: float) -> tuple[Floats, Floats]:
-    """Places of the columns and rows of nodes [m]: fine in the middle, coarser to the ends.
+def graded(begin: float, end: float, fine: float) -> Floats:
+    """Places between two, fine at both and coarser in between; ``begin`` is left out."""
+    half, step = [0.0], fine
+    while half[-1] + step < 0.5 * (end - begin):
+        half.append(half[-1] + step)
+        step = min(1.3 * step, 2.5e-4)
+    rest = 0.5 * (end - begin) / (half[-1] + step)
+    half = [rest * x for x in (*half, half[-1] + step)]
+    return np.array([begin + x for x in half[1:]] + [end - x for x in half[-2::-1]])
 
-    One column is where the beam is borne, this far from its middle.
+
+def lines(fine: float, bears: float) -> tuple[Floats, Floats]:
+    """Places of the columns and rows of nodes [m]: fine in the middle and where the beam is borne.
+
+    A point that bears gives way by the logarithm of the elements' size, and a tenth of all way is
+    that.
     """
     inner = np.arange(0.0, 6e-4 + 0.5 * fine, fine)
-    outer = [inner[-1]]
-    while outer[-1] < 0.5 * WIDE - 1e-9:
-        step = min(1.3 * (outer[-1] - (outer[-2] if len(outer) > 1 else inner[-2])), 2.5e-4)
-        left = 0.5 * WIDE - outer[-1]
-        outer.append(outer[-1] + (step if left > 1.5 * step else left))
-    half = np.concatenate([inner, outer[1:]])
-    half[np.argmin(np.abs(half - bears))] = bears
+    outer = graded(bears, 0.5 * WIDE, fine)
+    half = np.concatenate([inner, graded(inner[-1], bears, fine), outer])
     columns = 0.5 * WIDE + np.concatenate([-half[:0:-1], half])
     return columns, np.linspace(0.0, HIGH, round(HIGH / fine) + 1)
 
@@ -55,9 +61,9 @@ def lines(fine: float, bears: float) -> tuple[Floats, Floats]:
 class Beam:
     """Elements of half and half a notch: its two faces have nodes of their own."""
 
-    def __init__(self, fine: float, blunt: float = 0.0) -> None:
+    def __init__(self, fine: float, dx: float = 0.0) -> None:
         self.toughness = BEAM_TOUGHNESS / (1.0 + 0.5 * fine / LENGTH)
-        edge = PAD if blunt else 0.0
+        edge = 0.5 * BAR * dx
         x, y = lines(fine, 0.5 * WIDE - 2e-4 - edge)
         nx, ny = len(x), len(y)
         number = np.arange(nx * ny).reshape(nx, ny)
@@ -72,7 +78,7 @@ class Beam:
             cells.append([of[i, j], of[i + 1, j], of[i + 1, j + 1], of[i, j + 1]])
         self.cells = np.array(cells)
         middles = self.place[self.cells].mean(axis=1)
-        gone = (np.abs(middles[:, 0] - 0.5 * WIDE) < 0.5 * blunt) & (middles[:, 1] < DEEP)
+        gone = (np.abs(middles[:, 0] - 0.5 * WIDE) < 0.5 * NOTCH * dx) & (middles[:, 1] < DEEP)
         kept, self.cells = np.unique(self.cells[~gone], return_inverse=True)
         self.place, self.cells = self.place[kept], self.cells.reshape(-1, 4)
         size = np.stack([self.place[self.cells[:, 2]] - self.place[self.cells[:, 0]]])[0]
@@ -169,13 +175,16 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path, metavar="OUT")
-    parser.add_argument("--fine", type=float, default=0.03, help="edge in the middle [mm]")
+    parser.add_argument("--dx", type=float, default=0.0, help="of the study's grid [mm]; 0: a slit")
+    parser.add_argument(
+        "--fine", type=float, default=0.0, help="edge in the middle [mm]; default: half a notch"
+    )
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--blunt", type=float, default=0.0, help="width of the notch [mm]")
     parser.add_argument("--far", type=float, default=0.06, help="way of the load [mm]")
     args = parser.parse_args()
     begin = time.perf_counter()
-    beam = Beam(1e-3 * args.fine, 1e-3 * args.blunt)
+    fine = args.fine or 0.5 * NOTCH * args.dx or 0.03
+    beam = Beam(1e-3 * fine, 1e-3 * args.dx)
     ways, forces = [], []
     for way in np.linspace(0.0, 1e-3 * args.far, args.steps + 1)[1:]:
         for _ in range(60):
@@ -192,14 +201,14 @@ def main() -> int:
             break
     at = int(np.argmax(forces))
     args.out.mkdir(parents=True, exist_ok=True)
-    kind = f"notch of {args.blunt:g} mm" if args.blunt else "slit"
+    kind = f"notch of {NOTCH * args.dx:g} mm" if args.dx else "slit"
     found = {
-        "test": "elements", "blunt": args.blunt, "force": forces[at] / 1e6,
-        "setting": f"elements of {args.fine:g} mm, {kind}",
+        "test": "elements", "of": 1e-3 * args.dx, "force": forces[at] / 1e6,
+        "setting": f"elements of {fine:g} mm, {kind}",
         "moved": 1e6 * ways[at], "off": 0.0, "wall": time.perf_counter() - begin,
         "points": len(beam.place), "curve": [ways, forces], "machine": machine("cpu"),
     }  # fmt: skip
-    with atomic_path(args.out / f"bending_elements{'_blunt' if args.blunt else ''}.json") as path:
+    with atomic_path(args.out / f"bending_elements_{args.dx:g}.json") as path:
         path.write_text(json.dumps(found), encoding="utf-8")
     return 0
 

@@ -21,7 +21,7 @@ from gsfluent.ops.plasticity import weakened
 from gsfluent.pipeline.simulate.stage import Simulate
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from fracture_resolution import MELON
+from fracture_resolution import MELON, Trial
 
 STEPS, LOOKS = 20_000, 100
 SOLID = (1e6, 0.25, 1000.0)
@@ -45,6 +45,18 @@ class Throw:
     speed: float
     strength: float
     gravity: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Fruit(Trial):
+    """A melon of a matter of its own."""
+
+    ware: materials.Material | None = None
+
+    @property
+    def matter(self) -> materials.Material:
+        """What it is made of."""
+        return self.ware or super().matter
 
 
 THROWS = {"shatter": Throw(0.25, 4e4, 0.0), "ball": Throw(0.08, 2e4, GRAVITY)}
@@ -102,7 +114,7 @@ def floor(name: str, cells: int, device: str) -> tuple[dict[str, Any], None, Non
     begin, top = world.momentum(), mass * throw.speed * math.sqrt(SOLID[0] / SOLID[2])
     first = last = _energy(world, throw.gravity)
     gained = off = 0.0
-    weight = torch.tensor([0.0, 0.0, -mass * throw.gravity], dtype=torch.float64)
+    weight = begin.new_tensor([0.0, 0.0, -mass * throw.gravity])
     threads = torch.get_num_threads()
     same = True
     for _ in range(LOOKS):
@@ -113,7 +125,7 @@ def floor(name: str, cells: int, device: str) -> tuple[dict[str, Any], None, Non
         torch.set_num_threads(threads)
         now = _energy(world, throw.gravity)
         gained, last = max(gained, (now - last) / abs(first)), now
-        left = world.momentum() - begin - (world.impulse.sum(dim=0) + weight * world.time).to(begin)
+        left = world.momentum() - begin - world.impulse.sum(dim=0).to(begin) - weight * world.time
         off = max(off, float(left.abs().max()) / top)
         same = same and torch.equal(world.position[order.to(world.position.device)], other.position)
     return {
@@ -136,7 +148,8 @@ def melon(cells: int, seed: int, height: float, device: str) -> tuple[dict[str, 
     ware = fruit.override(
         law="phase_field", length=MELON_LENGTH, prefer="strength", split="rankine"
     )
-    trial = dataclasses.replace(MELON, material=ware, height=1e-3)
+    given = {field.name: getattr(MELON, field.name) for field in dataclasses.fields(MELON)}
+    trial = Fruit(**{**given, "height": 1e-3}, ware=ware)
     scene = trial.scene()
     scene.throw((0.0, 0.0, -math.sqrt(2.0 * GRAVITY * height)))  # the end of its fall
     dx = 2.0 * max(trial.half) / cells
