@@ -302,43 +302,34 @@ def parted(change: Motion, at: Motion, ranges: Sequence[tuple[int, int]]) -> lis
     Returns:
         Four; the impulse goes with the strain.
     """
-    sizes = (3, 3, 6)
     place = [torch.zeros_like(change.position) for _ in range(4)]
     map = [torch.zeros_like(change.deformation) for _ in range(4)]
     push = [torch.zeros_like(change.impulse) for _ in range(4)]
-    push[2] = change.impulse
-    place[3], map[3] = change.position.clone(), change.deformation.clone()
+    place[3], map[3], push[2] = change.position.clone(), change.deformation.clone(), change.impulse
+    even = _patterns(change.position.dtype)
     for a, b in ranges:
         arm = at.position[:, a:b] - at.position[:, a:b].mean(dim=1, keepdim=True)
-        made = [eye.expand_as(arm) for eye in torch.eye(3, dtype=arm.dtype)]
-        maps = _turns_and_strains(arm.dtype)
-        made += [arm @ m.T for m in maps]
-        columns = torch.stack(made, dim=-1).flatten(1, 2)  # [T, 3 n, 12]
-        wanted = change.position[:, a:b].flatten(1)[..., None]
-        # flat matter has no strain across: the least numbers that do
-        found = (torch.linalg.pinv(columns, rtol=1e-6) @ wanted)[..., 0]  # [T, 12]
-        first = 0
-        for k, size in enumerate(sizes):
-            part = slice(first, first + size)
-            moved = (columns[..., part] @ found[:, part, None]).reshape(arm.shape)
-            place[k][:, a:b] = moved
+        shift = torch.eye(3, dtype=arm.dtype).expand(*arm.shape, 3)
+        columns = torch.cat([shift, torch.einsum("kij,tnj->tnik", even[3:], arm)], dim=-1)
+        # flat matter shows no strain across: of what fits the least
+        inverse = torch.linalg.pinv(columns.flatten(1, 2), rtol=1e-6)
+        size = torch.einsum("tkr,tr->tk", inverse, change.position[:, a:b].flatten(1))
+        for k, part in enumerate((slice(0, 3), slice(3, 6), slice(6, 12))):
+            moved = torch.einsum("tnik,tk->tni", columns[..., part], size[:, part])
+            turned = torch.einsum("tk,kij->tij", size[:, part], even[part])
+            turned = turned[:, None] @ at.deformation[:, a:b]
+            place[k][:, a:b], map[k][:, a:b] = moved, turned
             place[3][:, a:b] -= moved
-            if k > 0:
-                even = torch.einsum("tk,kij->tij", found[:, part], maps[first - 3 : first - 3 + size])
-                turned = even[:, None] @ at.deformation[:, a:b]
-                map[k][:, a:b] = turned
-                map[3][:, a:b] -= turned
-            first += size
+            map[3][:, a:b] -= turned
     return [change._replace(position=x, deformation=m, impulse=i)
             for x, m, i in zip(place, map, push, strict=True)]  # fmt: skip
 
 
-def _turns_and_strains(dtype: torch.dtype) -> Tensor:
-    """Gradients of three turns and six even strains, [9, 3, 3]."""
-    found = []
-    for sign in (-1.0, 1.0):
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            one = torch.zeros(3, 3, dtype=dtype)
-            one[i, j], one[j, i] = 1.0, sign
-            found.append(one)
-    return torch.stack([*found, *(torch.diag(eye) for eye in torch.eye(3, dtype=dtype))])
+def _patterns(dtype: torch.dtype) -> Tensor:
+    """Gradients of three shifts, three turns and six even strains, [12, 3, 3]."""
+    found = torch.zeros(12, 3, 3, dtype=dtype)
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        found[3 + k, i, j], found[3 + k, j, i] = -1.0, 1.0
+        found[6 + k, i, j] = found[6 + k, j, i] = 1.0
+        found[9 + k, k, k] = 1.0
+    return found
