@@ -6,7 +6,8 @@ python scripts/study/fit/tracks.py --device cuda --jobs 6 --truths DIR  # truths
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
 the tracks, each place seen half a millimetre off (standard deviation of a coordinate). Ranges lie
-about the objects of PAC-NeRF; elastic and Newtonian matter starts as in its files. One JSON line per scene.
+about the objects of PAC-NeRF; elastic and Newtonian matter starts as in its files. One JSON line
+per scene.
 """
 
 from __future__ import annotations
