@@ -23,9 +23,7 @@ OFFSET = "floor.offset"
 LOGITS = "logits"
 """Of an object: how much more the matter at its nodes is of each law than of the first."""
 FINER = "grid.extrapolation"
-"""How far a motion goes on from the coarser grid through the finer one, by parts."""
-PARTS = 4
-"""Of what the finer grid changes: shifts, turns, even strains, and what is left."""
+"""How far a motion goes on from the coarser grid through the finer one."""
 _NU, _ANGLE = 0.49, 60.0
 _FIXED = ("density", "cohesion", "hardening", "alpha0", "shear_damage", "poisson_ratio")
 _SPREAD = {"velocity": 5.0, "angular_velocity": 10.0}

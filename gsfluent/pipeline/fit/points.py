@@ -25,6 +25,7 @@ from gsfluent.materials import LAWS, Material
 from gsfluent.pipeline.fit.forward import Forward, Matter
 from gsfluent.pipeline.fit.laws import NUMBERS, under_law
 from gsfluent.pipeline.fit.parameters import (
+    FINER,
     LOGITS,
     VECTORS,
     Parameter,
@@ -33,7 +34,7 @@ from gsfluent.pipeline.fit.parameters import (
     read_learn,
 )
 from gsfluent.pipeline.fit.solve import Problem, in_stages
-from gsfluent.pipeline.fit.task import OFFSET, OFFSET_PRIOR, RATIO, extrapolation
+from gsfluent.pipeline.fit.task import EXTRAPOLATION, OFFSET, OFFSET_PRIOR, RATIO
 from gsfluent.scene.scene import Part, Scene
 from gsfluent.targets.target import Target
 
@@ -213,7 +214,7 @@ def _unknowns(task: FieldTask, grid: Mixed) -> Unknowns:
     if task.offset and task.scene.floor is not None and not task.scene.colliders:
         made.append(Parameter(OFFSET, (OFFSET_PRIOR[0],), spread=OFFSET_PRIOR[1]))
     if task.grids == 2:
-        made.append(extrapolation())
+        made.append(Parameter(FINER, (EXTRAPOLATION[0],), spread=EXTRAPOLATION[1]))
     return Unknowns(made)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsfluent.pipeline.fit.forward import Forward, parted
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import FINER, Unknowns
 from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.targets.target import Followers, Motion, Observer
@@ -124,7 +124,7 @@ class Problem:
     ) -> None:
         self.forward, self.observer, self.unknowns = forward, observer, unknowns
         self.step, self.fixed = step, fixed or {}
-        self.change: list[Motion] = []
+        self.change: Motion | None = None
         self.trust = np.ones((len(forward.times), 1 + len(PATTERNS)))
         self.modes: dict[int, Array] = {}
         self._moved = np.zeros((len(forward.times), len(PATTERNS)))
@@ -148,7 +148,7 @@ class Problem:
     ) -> list[Motion]:
         """Runs of several coordinates, side by side where that is cheaper."""
         sets = [self.fixed | self.unknowns.values(free) for free in places]
-        more = [np.ravel(values.pop(FINER, 0.0)) for values in sets]
+        more = [values.pop(FINER, 0.0) for values in sets]
         known = [self._last is not None and self._last[0] == (v, frames, dt) for v in sets]
         left = [values for values, is_known in zip(sets, known, strict=True) if not is_known]
         group = self.forward.side_by_side
@@ -164,35 +164,34 @@ class Problem:
             found.append(self._corrected(moved, frames, part))
         return found
 
-    def _corrected(self, moved: Motion, frames: int, more: Array) -> Motion:
-        """With so much of each part of what the finer grid changes."""
-        for change, share in zip(self.change, more, strict=False):
-            moved = moved._replace(
-                **{k: v + float(share) * getattr(change, k)[:frames]
-                   for k, v in moved._asdict().items() if k != "strain"}
-            )  # fmt: skip
-        return moved
+    def _corrected(self, moved: Motion, frames: int, more: float) -> Motion:
+        """With so much of what the finer grid changes."""
+        if self.change is None:
+            return moved
+        return moved._replace(
+            **{k: v + more * getattr(self.change, k)[:frames] for k, v in moved._asdict().items()
+               if k != "strain"}
+        )  # fmt: skip
 
     def refine(self, finer: Forward, free: Array, frames: int) -> None:
         """See at these coordinates what a finer grid changes, and how far it is to be trusted."""
         values = self.fixed | self.unknowns.values(free)
-        self.change = []
+        self.change = None
         coarse = run_at(self, free, frames)[1]
         values.pop(FINER, None)
         fine = _steady(lambda dt: finer.run(values, frames, dt), finer.step(values))[1]
         follow = Followers("fit", self.forward.rest, finer.setting())
         there = [follow.places(fine, k) for k in range(frames)]
-        change = Motion(
+        self.change = Motion(
             torch.stack([place for place, _ in there]) - coarse.position,
             torch.stack([map for _, map in there]) - coarse.deformation,
             fine.impulse - coarse.impulse,
             fine.strain,
         )
-        self.change = parted(change, coarse, self.forward.ranges)
         pairs = self.observer.pair(coarse)
         with_it = coarse._replace(
-            position=coarse.position + change.position,
-            deformation=coarse.deformation + change.deformation, impulse=fine.impulse,
+            position=coarse.position + self.change.position,
+            deformation=coarse.deformation + self.change.deformation, impulse=fine.impulse,
         )  # fmt: skip
         gap, frame = self._gaps(coarse, frames, pairs)
         shift = self._gaps(with_it, frames, pairs)[0] - gap

@@ -229,18 +229,15 @@ class Fit(Stage):
 
 
 def of_the_grid(unknowns: Unknowns, free: Array, information: Any) -> Array:
-    """By how much each part of the change to the finer grid has moved each number: linearised.
-
-    Returns:
-        Free [P, G]; G is 0 with one grid.
-    """
-    part = unknowns.slices().get(FINER, slice(0, 0))
-    rows = np.ones(len(unknowns), bool)
-    rows[part] = False
+    """By how much the change to the finer grid has moved each number: linearised, free [P]."""
+    part = unknowns.slices().get(FINER)
+    if part is None:
+        return np.zeros(len(unknowns))
+    rows = np.arange(len(unknowns)) != part.start
     normal = np.asarray(information)
     whole = normal + np.diag(1.0 / unknowns.spread**2)
-    moved = np.zeros((len(unknowns), part.stop - part.start))
-    pull = normal[rows, part] * free[part]
+    moved = np.zeros(len(unknowns))
+    pull = normal[rows, part.start] * free[part.start]
     moved[rows] = -np.linalg.solve(whole[np.ix_(rows, rows)], pull)
     return moved
 
@@ -258,15 +255,15 @@ def conclude(
     """
     free = np.asarray(found["free"])
     covariance = np.asarray(found["covariance"])
-    slices = unknowns.slices()
     grid = of_the_grid(unknowns, free, found["information"])
-    went = np.maximum(np.abs(free[slices.get(FINER, slice(0, 0))]), 0.5)
-    sd = np.sqrt(np.diag(covariance) + ((LEFT * grid / went) ** 2).sum(axis=1))
+    went = max(abs(float(unknowns.values(free).get(FINER, 1.0))), 0.5)
+    sd = np.sqrt(np.diag(covariance) + (LEFT * grid / went) ** 2)
     slope = np.abs(unknowns.slope(free))
     share = np.clip(np.diag(covariance) / unknowns.spread**2, 0.0, 1.0)
     deviation = np.sqrt(np.diag(covariance))
     related = covariance / np.outer(deviation, deviation)
     labels, values = unknowns.labels(), unknowns.values(free)
+    slices = unknowns.slices()
     pairs = {
         (labels[i], labels[j]): float(related[i, j])
         for i in range(len(labels))
@@ -285,7 +282,7 @@ def conclude(
             "value": values[p.key],
             "sd": spread[p.key],
             "sd_noise": (deviation[part] * slope[part]).tolist(),
-            "grid": (grid[part].sum(axis=1) * slope[part]).tolist(),
+            "grid": (grid[part] * slope[part]).tolist(),
             "prior_share": float(share[part].max()),
         }
     strain = float(found["strain"])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsfluent.pipeline.fit.forward import Forward
-from gsfluent.pipeline.fit.parameters import FINER, OFFSET, PARTS, Parameter, Unknowns, read_learn
+from gsfluent.pipeline.fit.parameters import FINER, OFFSET, Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, in_stages, run_at
 from gsfluent.pipeline.fit.together import TooFast
 from gsfluent.scene.scene import Scene
@@ -119,11 +119,6 @@ def one_by_one(function: Callable[[Any], Any], items: Iterable[Any]) -> list[Any
     return [function(item) for item in items]
 
 
-def extrapolation() -> Parameter:
-    """Shares of the change to the finer grid: of shifts, turns, even strains, and what is left."""
-    return Parameter(FINER, (EXTRAPOLATION[0],) * PARTS, spread=EXTRAPOLATION[1])
-
-
 def unknowns_of(
     scene: Scene,
     learn: Mapping[str, Mapping[str, Any]] | Sequence[str],
@@ -146,5 +141,5 @@ def unknowns_of(
     if offset and scene.floor is not None and not scene.colliders:
         more.append(Parameter(OFFSET, (OFFSET_PRIOR[0],), spread=OFFSET_PRIOR[1]))
     if grids == 2:
-        more.append(extrapolation())
+        more.append(Parameter(FINER, (EXTRAPOLATION[0],), spread=EXTRAPOLATION[1]))
     return Unknowns([*read_learn(scene, learn).parameters, *more])

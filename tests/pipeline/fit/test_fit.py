@@ -17,13 +17,13 @@ from gsfluent.errors import InputError
 from gsfluent.geometry import look_at
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
-from gsfluent.pipeline.fit.forward import Forward, parted
+from gsfluent.pipeline.fit.forward import Forward
 from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
 from gsfluent.pipeline.fit.solve import Problem, _covariance, in_stages, lasting, linearise, search
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
 from gsfluent.pipeline.matter import build_matter
 from gsfluent.targets import Clouds, Force, Masks, Points
-from gsfluent.targets.target import Followers, Motion
+from gsfluent.targets.target import Followers
 
 DX = 0.08
 NAMES = ["thing.young_modulus", "thing.poisson_ratio", "thing.velocity"]
@@ -225,33 +225,9 @@ def test_a_finer_grid_sets_right_what_a_coarse_one_does_wrong() -> None:
     error = [abs(math.log10(f.values[NAMES[0]]) - 5.0) for f in (one, two)]
     assert error[1] < 0.25 * error[0]
     assert two.report["rms"] < 0.6 * one.report["rms"]
-    assert all(0.8 < c < 2.2 for c in two.values["grid.extrapolation"])
+    assert 1.0 < two.values["grid.extrapolation"] < 2.0
     moved = two.report["parameters"][NAMES[0]]["grid"][0]
     assert two.sd[NAMES[0]] >= 0.5 * LEFT * abs(moved) > 0.0
-
-
-def test_a_change_is_parted_into_shift_turn_strain_and_rest() -> None:
-    """Of two bodies that move evenly, each in its own way, nothing is left; of noise most is."""
-    random = torch.Generator().manual_seed(0)
-    place = torch.rand(2, 30, 3, dtype=torch.float64, generator=random)
-    eye = torch.eye(3, dtype=torch.float64).expand(2, 30, 3, 3)
-    at = Motion(place, eye, torch.zeros(2, 1, 3), torch.zeros(()))
-    turn = torch.tensor([[0.0, -0.1, 0.0], [0.1, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    strain = torch.diag(torch.tensor([0.0, 0.0, 0.2], dtype=torch.float64))
-    ranges, moved, maps = [(0, 10), (10, 30)], torch.zeros_like(place), torch.zeros_like(eye)
-    for (a, b), even in zip(ranges, (turn, strain), strict=True):
-        arm = place[:, a:b] - place[:, a:b].mean(dim=1, keepdim=True)
-        moved[:, a:b], maps[:, a:b] = arm @ even.T + 0.5, even
-    push = torch.ones(2, 1, 3)
-    parts = parted(Motion(moved, maps, push, torch.zeros(())), at, ranges)
-    for part, size in zip(parts, (0.5, 0.1, 0.2, 0.0), strict=True):
-        assert bool((part.position.abs().max() > 1e-9) == (size > 0.0))
-        assert float(part.deformation.abs().max()) == pytest.approx(
-            0.0 if size == 0.5 else size, abs=1e-12
-        )
-    torch.testing.assert_close(parts[0].position, torch.full_like(moved, 0.5))
-    for name, whole in (("position", moved), ("deformation", maps), ("impulse", push)):
-        torch.testing.assert_close(sum(getattr(part, name) for part in parts), whole)
 
 
 def test_coordinates_and_values_are_inverse() -> None:
