@@ -186,7 +186,9 @@ def run_field(task: FieldTask) -> dict[str, Any]:
             f"fit: {len(unknowns)} numbers for {len(task.laws)} laws on {task.nodes}^3 nodes",
             f"take fewer laws or nodes: {MOST_NUMBERS} numbers at most",
         )
-    problem = Problem(grids[0], task.target.observe(grids[0].setting()), unknowns, task.target.step)
+    bound = [task.target.observe(grid.setting()) for grid in grids]
+    problem = Problem(grids[0], bound[0], unknowns, task.target.step,
+                      fine=bound[1] if task.grids == 2 else None)  # fmt: skip
     free = unknowns.start
     for number, temperature in enumerate(TEMPERATURES):
         for grid in grids:
