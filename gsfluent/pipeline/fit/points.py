@@ -80,7 +80,7 @@ class Mixed(Forward):
         alone.__dict__.update(scene.__dict__)
         alone.bodies = [plain]
         super().__init__(alone, times, dx, device=device)
-        self.solid = not {LAWS[law] for law in laws} & {LAWS["fluid"], LAWS["drucker_prager"]}
+        self.solid = "fluid" not in laws
         self.basis = corners(self.rest, self.rest, nodes)
         self._numbers = torch.tensor([LAWS[law] for law in laws], dtype=torch.int32)
 

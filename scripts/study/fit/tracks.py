@@ -5,7 +5,7 @@ python scripts/study/fit/tracks.py --device cuda --jobs 6 --truths DIR  # truths
 
 Ellipsoids fall on a floor. The truth is simulated as `gsfluent run` does it (float32, shaken
 points, its own time steps) at half the spacing of the finer grid of the fit; 150 of its points are
-the tracks, each place seen half a millimetre off (standard deviation of a coordinate). Ranges lie
+the tracks, each coordinate seen with a noise of 0.1 mm. Ranges lie
 about the objects of PAC-NeRF; elastic and Newtonian matter starts as in its files. One JSON line
 per scene.
 """
@@ -44,7 +44,7 @@ DATA = Path(__file__).resolve().parents[3] / "docs" / "measured" / "data"
 PAGE = DATA.parent / "fit.md"
 FPS, FRAMES, TRACKS, SIDE, GAP = 24.0, 12, 150, 0.3, 0.25
 VOXELS = 48
-NOISE = 5e-4
+NOISE = 1e-4
 """Of a coordinate of a track [m]: without it bands of velocities would have nothing to hold."""
 
 
