@@ -117,14 +117,13 @@ class SolveSettings:
         default=False,
     )
     contact: str = key(
-        choice("nodes", "points"),
-        "What floors, colliders and other bodies push: `nodes` of the grid, up to 1.5 cells before "
-        "the matter is there, or its `points` where they are (`cfl` at most 0.5; on a CPU steps "
-        "take a tenth longer on a floor, up to twice as long where two objects touch over a whole "
-        "face; what lands faster than a third of its wave speed sinks in by half a cell). Pieces "
-        "of one body touch at nodes.",
-        "points",
-        default="nodes",
+        choice("auto", "points", "nodes"),
+        "What floors, colliders and other bodies push: the `points` of the matter where they are "
+        "(`cfl` at most 0.5), or `nodes` of the grid, up to 1.5 cells before the matter is there, "
+        "which take away part of every bounce. `auto`: points, but nodes where `cfl` is above 0.5; "
+        "`run.json` says which. Pieces of one body touch at nodes.",
+        "nodes",
+        default="auto",
     )
     inertia: str = key(
         choice("grid", "body"),

@@ -45,7 +45,7 @@ from gsfluent.progress import Progress
 from gsfluent.scene.scene import Scene
 from gsfluent.stages.breaking import breaking_rows
 from gsfluent.stages.findings import cells_for, cells_for_walls, lowered, setting, walls_note
-from gsfluent.stages.simulate import build_scene
+from gsfluent.stages.simulate import build_scene, solver_options
 
 
 def cost_model(
@@ -141,7 +141,8 @@ def plan_shot(
     """Plan a shot.
 
     Returns:
-        ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``cells``,
+        ``passes`` (name, needed, why), ``bounds``, ``binding`` and ``budget``, ``dx``, ``contact``
+        (``points`` or ``nodes``), ``cells``,
         ``breaking`` (:func:`gsfluent.stages.breaking.breaking_rows`), ``dt``, ``substeps``,
         ``particles``, ``active_blocks``, ``stages`` (seconds and
         memory_bytes by name), ``seconds``, ``memory_bytes``, ``simulate_seconds``, ``frames``,
@@ -192,6 +193,7 @@ def plan_shot(
         "frames": prospect.frames,
         "cells": chosen,
         "dx": dx,
+        "contact": solver_options(shot).contact,
         "bounds": [bound.row() for bound in bounds],
         "binding": binding,
         "budget": _budget(prospect, model),

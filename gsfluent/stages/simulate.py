@@ -111,13 +111,14 @@ def moving_settings(shot: Shot) -> list[Any]:
         name: [_moving(settings), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
+    contact = solver_options(shot).contact
     return [
         objects,
         [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
-        # as it was before there was a choice, where none is made
-        [shot.solve.standing, *([shot.solve.contact] if shot.solve.contact != "nodes" else [])],
+        # as it was before there was a choice, where nodes are held
+        [shot.solve.standing, *([] if contact == "nodes" else [contact])],
         *([shot.solve.inertia] if shot.solve.inertia != "grid" else []),
         *([] if shot.heat is None else [dataclasses.asdict(shot.heat)]),
         shot.output.fps,
@@ -132,7 +133,7 @@ def solver_options(shot: Shot) -> SolverOptions:
         cfl=solve.cfl,
         standing=solve.standing,
         deterministic=solve.deterministic,
-        surface=solve.contact == "points",
+        surface=None if solve.contact == "auto" else solve.contact == "points",
         inertia=solve.inertia == "body",
         all_devices=solve.devices == "all",
     )

@@ -26,6 +26,8 @@ WHOLE = 1e-3
 """Share of a body's mass that may break while the body still counts as unbroken."""
 _FELT = 0.05
 """Least change of velocity [approach speed] within a frame that shows that two things touched."""
+_UNTOUCHED = 1e-5
+"""Change of velocity [approach speed] within a frame that is only rounding."""
 _LEAST = 1e-3
 """Least approach speed of a strike [m/s], where gravity sets none."""
 
@@ -238,9 +240,10 @@ class Strikes:
                 low - torch.tensor(theirs["high"]), torch.tensor(theirs["low"]) - high
             )
             gap = float(apart.clamp(min=0.0).norm())
-            felt = max(change, self._change(theirs, after["bodies"][other], dt))
-            felt -= float(self.gravity.norm()) * dt
-            if gap <= LANDING * self.matter.dx + speed * dt and felt > _FELT * speed:
+            answer = self._change(theirs, after["bodies"][other], dt)
+            felt = max(change, answer) - float(self.gravity.norm()) * dt
+            met = min(change, answer) > _UNTOUCHED * speed  # one that flies on met nothing
+            if met and gap <= LANDING * self.matter.dx + speed * dt and felt > _FELT * speed:
                 speeds[body.name] = speed
         return speeds
 

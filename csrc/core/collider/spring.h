@@ -16,11 +16,12 @@ constexpr double kSpringStep = 0.25;
 // Damping of the springs in periods of a cell's wave, so that what stands on them comes to rest: a
 // body that chatters is not held by friction.
 constexpr double kSpringDamping = 0.1;
-// Depth [cells] from which on the force does not grow.
-constexpr double kSpringDepth = 1.0;
+// Depth [cells] from which on the force grows so many times as fast, and that from which on it does
+// not grow: what lands below a fifth of its wave speed does not get there, and bounces off a spring
+// as soft as a cell.
+constexpr double kSpringSteep = 0.5, kSteeper = 4.0, kSpringDepth = 1.0;
 // Depths [cells] between which a point comes to lose all of its approach in a step: what is faster
-// than its own waves would outrun a spring. Only what lands above a third of their speed gets
-// there, and loses it in its own shock as well.
+// than its own waves would outrun a spring.
 constexpr double kSpringBrake = 0.5, kSpringStop = 0.75;
 // Nodes so deep [cells] inside are held as without springs: what came through them is stopped.
 constexpr double kSpringNode = 1.25;
@@ -42,7 +43,9 @@ GSF_HOST_DEVICE bool collider_springs(const T* row) {
 template <typename T>
 GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt, T longest, T times) {
   const T rate = min(wave * wave / (dx * length), T(kSpringStep) / (longest * longest));
-  return dt * times * rate * min(depth, T(kSpringDepth) * dx);
+  depth = min(depth, T(kSpringDepth) * dx);
+  const T deep = max(depth - T(kSpringSteep) * dx, T(0));
+  return dt * rate * (times * depth + max(T(kSteeper) - times, T(0)) * deep);
 }
 
 // Share of its approach that a point at this depth [m] loses in a step at least.

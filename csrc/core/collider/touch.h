@@ -22,8 +22,10 @@ constexpr double kTouchStep = 0.125;
 // How fast the share of a half space falls a quarter of a cell outside of it [1 / cells], where the
 // points of a lattice of 8 per cell touch. Its steepest is 1.23.
 constexpr double kTouchSlope = 0.9505078196525574;
-// Centroid distance [cells] up to which nodes of such bodies touch as without: they went through.
-constexpr double kTouchGap = 0.0;
+// Centroid distance [cells] up to which nodes of such bodies touch as without: what is pressed or
+// bounces below a quarter of its wave speed stays further apart, and what is faster would go on
+// through, after which normals point the wrong way.
+constexpr double kTouchGap = 0.4;
 
 // Kernel at the squared distance r2 in [0, 1] [1 / cells^3].
 GSF_HOST_DEVICE double touch_kernel(double r2) {

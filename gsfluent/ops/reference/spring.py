@@ -11,6 +11,7 @@ from torch import Tensor
 from gsfluent.ops.reference.collider import signed_distance
 
 STEP = 0.25  # largest (frequency times longest step)^2
+STEEP, STEEPER = 0.5, 4.0  # cells from which on the force grows so many times as fast
 DEPTH = 1.0  # cells from which on the force does not grow
 BRAKE, STOP = 0.5, 0.75  # cells between which a point comes to lose all of its approach at least
 DAMPING = 0.1  # of a spring, in dx / wave speed
@@ -57,7 +58,9 @@ def point_push(
     depth = torch.where(deep > 0, deep - DAMPING * dx / wave * away, 0.0).clamp(0.0, DEPTH * dx)
     rate = (wave**2 / (dx * length)).clamp(max=STEP / longest**2)
     stopped = -away * ((deep / dx - BRAKE) / (STOP - BRAKE)).clamp(0.0, 1.0)
-    gained = (dt * (1.0 + row[31]) * rate * depth).maximum(stopped)
+    times = 1.0 + row[31]
+    steep = (STEEPER - times).clamp(min=0.0) * (depth - STEEP * dx).clamp(min=0.0)
+    gained = (dt * rate * (times * depth + steep)).maximum(stopped)
     return (mass * gained)[:, None] * normal
 
 

@@ -16,11 +16,11 @@ from gsfluent.io.atomic import write_tensors
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
-VERSION = 8
+VERSION = 9
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation", "viscous")
 _POINTS = (
     "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
-    "lowest", "alpha_seen", "time_seen",
+    "lowest", "alpha_seen", "time_seen", "calm_at",
 )  # fmt: skip
 _WHOLE = ("impulse", "colliders", "work", "dissipated", "cut_links")
 _SAVED = {"loose": "stray"}
@@ -61,6 +61,7 @@ class State(NamedTuple):
             -1 for points on the grid and for bodies in their first flight.
         asleep: Whether that group rests (else it flies), bool [N].
         calm: Frames in a row during which the point hardly moved, int16 [N].
+        calm_at: Where it was when these were last counted [m], float64 [N, 3].
         dissipated: Kinetic energy of vibration and of creep that went when groups left the grid
             [J], float64 [].
         unit: What each point hung together with when that was last looked at, int64 [N]: the first
@@ -94,6 +95,7 @@ class State(NamedTuple):
     group: Tensor
     asleep: Tensor
     calm: Tensor
+    calm_at: Tensor
     dissipated: Tensor
     unit: Tensor
     ever: Tensor
@@ -134,6 +136,7 @@ class State(NamedTuple):
             group=torch.full_like(p.body, -1),
             asleep=none,
             calm=torch.zeros(p.count, dtype=torch.int16, device=p.device),
+            calm_at=p.position.to(torch.float64),
             dissipated=zero,
             unit=torch.tensor([a for a, _ in matter.ranges], device=p.device)[p.body.long()],
             ever=matter.brittle & (p.alpha >= 0),

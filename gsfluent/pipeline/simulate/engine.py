@@ -104,7 +104,8 @@ class SolverOptions:
         surface: Let plain separating colliders and other bodies push the points, so that bodies lie
             on floors and on each other and not up to 1.5 cells above them (docs/theory/colliders.md
             and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver
-            only; the composed operators hold nodes.
+            only; the composed operators hold nodes. None: where ``cfl`` is at most 0.5, which is
+            as far as they make no energy.
         inertia: Share out the mass of elastic bodies so that thin ones turn and twist as fast as
             they should (:func:`gsfluent.ops.inertial_shares`). Points near surfaces are lighter.
         all_devices: Step scenes of many points on all GPUs of this machine, with the bits of one
@@ -128,7 +129,7 @@ class SolverOptions:
     contact_proximity: bool = True
     deterministic: bool = False
     standing: bool = False
-    surface: bool = False
+    surface: bool | None = None
     inertia: bool = True
     all_devices: bool = False
     return_map: Mapping[str, float | bool] = dataclasses.field(default_factory=dict)
@@ -138,6 +139,12 @@ class SolverOptions:
     def flip(self) -> float:
         """Share of their own motion that points keep where the solver can (docs/theory/mpm.md)."""
         return max(0.0, 1.0 - self.cfl / CFL)
+
+    @property
+    def contact(self) -> str:
+        """What floors and other bodies push, ``"points"`` or ``"nodes"``."""
+        pushed = self.cfl <= CFL_MOST if self.surface is None else self.surface
+        return "points" if pushed else "nodes"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cfl <= 1.0:

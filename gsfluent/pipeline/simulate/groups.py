@@ -31,6 +31,9 @@ CALM_FRAMES = 3
 """Frames in a row at rest before a group sleeps."""
 CALM = 0.02
 """Speed of rest, in units of sqrt(|gravity| dx): of what a fall through one cell gives."""
+TREMBLE = 0.2
+"""Speed, in the same units, of what stays in its place and rests all the same: it lifts by a
+fiftieth of a cell."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -82,13 +85,26 @@ def grid_mask(state: State, matter: Matter) -> Tensor:
     return mask
 
 
-def count_calm(state: State, on_grid: Tensor, gravity: Tensor, dx: float) -> State:
-    """Count the frames during which points hardly moved."""
+def count_calm(state: State, on_grid: Tensor, gravity: Tensor, dx: float, frame: float) -> State:
+    """Count the frames during which points hardly moved.
+
+    What trembles in one place rests, too: a springy body on a floor that pushes its points keeps
+    for seconds what lifts it by less than anyone sees.
+
+    Args:
+        state: State at a frame.
+        on_grid: Points on the grid, bool [N].
+        gravity: Acceleration [m/s^2], float64 [3].
+        dx: Grid spacing [m].
+        frame: Time since they were last counted [s].
+    """
     p = state.particles
+    unit = float(gravity.norm() * dx) ** 0.5
     speed = p.velocity.norm(dim=1) + dx * torch.linalg.matrix_norm(p.affine)
-    slow = speed < CALM * float(gravity.norm() * dx) ** 0.5
+    moved = (state.position - state.calm_at).norm(dim=1) / frame
+    slow = (speed < CALM * unit) | ((moved < CALM * unit) & (speed < TREMBLE * unit))
     calm = torch.where(slow, state.calm + 1, torch.zeros_like(state.calm)).clamp(max=1000)
-    return state._replace(calm=torch.where(on_grid, calm, state.calm))
+    return state._replace(calm=torch.where(on_grid, calm, state.calm), calm_at=state.position)
 
 
 class Leaving:

@@ -205,7 +205,7 @@ class Resident:
         there = torch.cuda.device_count() if p.device.type == "cuda" else 1
         if options.all_devices and there > 1 and len(p.mass) >= WORTH_DEVICES:
             constants["devices"] = [f"cuda:{i}" for i in range(there)]
-        if options.surface:
+        if options.contact == "points":
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(
                 torch.tensor([end - start for start, end in matter.ranges])

@@ -362,6 +362,7 @@ class Run:
             "momentum_bar": MOMENTUM_BAR,
             "guarded_points": c.guarded,
             "inverted_points": c.inverted,
+            "contact": self.stepper.options.contact,
             "contact_nodes": c.contact_nodes,
             "shared_sites_max": c.shared_sites,
             "fields_max": c.fields_max,

@@ -144,7 +144,7 @@ class Stepper:
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
-        state = count_calm(state, on_grid, self._gravity, self.matter.dx)
+        state = count_calm(state, on_grid, self._gravity, self.matter.dx, frame)
         state = self.leaving(state, state.unit, frame)
         self.counters.naps, self.counters.piece_flights = self.leaving.naps, self.leaving.flights
         return state

@@ -114,8 +114,9 @@ def meeting() -> Scene:
 
 @pytest.mark.parametrize("resident", [True, False])
 def test_contact_is_looked_for_only_where_bodies_are_near(resident: bool) -> None:
-    on = Ran(meeting(), fps=40, seconds=0.1, free_flight=False, resident=resident)
-    off = Ran(meeting(), fps=40, seconds=0.1, free_flight=False, contact_proximity=False)
+    more = {"free_flight": False, "surface": False}  # the composed operators know nodes alone
+    on = Ran(meeting(), fps=40, seconds=0.1, resident=resident, **more)
+    off = Ran(meeting(), fps=40, seconds=0.1, contact_proximity=False, **more)
     assert on.report["contact_nodes"] > 0 and off.report["contact_nodes"] > 0
     assert on.skipped["contact_block_fraction"] > 0.0 == off.skipped["contact_block_fraction"]
     assert on.skipped["contact_steps"] > 0 == off.skipped["contact_steps"]
@@ -182,14 +183,13 @@ def test_what_rests_sleeps() -> None:
     assert off.report["naps"] == 0 == off.skipped["sleeping_fraction"]
     assert on.report["substeps"] < 0.9 * off.report["substeps"]
     weight = float(on.frames[0].particles.mass.sum()) * 9.81
-    assert on.report["frozen_motion"] < 1e-4 * weight * 0.04
+    assert on.report["frozen_motion"] < 0.01 * weight * DX  # no more than lifts it by that
     assert_same(on, off, place=0.02, energy=0.01, momentum=0.02)
 
 
 def test_what_sleeps_wakes_when_something_comes() -> None:
     on, off = (Ran(resting(True), fps=10, seconds=2.0, sleep=flag) for flag in (True, False))
     assert on.report["naps"] >= 1 and on.report["wakes"] >= 1 and off.report["wakes"] == 0
-    assert on.report["contact_nodes"] > 0
     lower = on.frames[0].particles.body == 0
     pushed = on.frames[-1].particles.velocity[lower].norm(dim=1).mean()
     assert float(pushed) > 0.1  # it felt the blow
