@@ -113,7 +113,8 @@ GSF_HOST_DEVICE bool project_geometry(const RasterArgs<T>& a, const SplatCamera<
     splat_frame_axes(axes, a.scales + 3 * i, &frame);
   }
   const T ox = a.offset ? a.offset[2 * row] : T(0), oy = a.offset ? a.offset[2 * row + 1] : T(0);
-  return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s);
+  return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s) &&
+         !splat_box(s->x, s->y, s->extent_x, s->extent_y, cam.width, cam.height).empty();
 }
 
 // False for what is not drawn, NaN among it.
@@ -140,15 +141,14 @@ GSF_HOST_DEVICE bool sh_color(int degree, const Vec3<T>& direction, const T* c, 
 }
 
 // Colours, normal and depth of Gaussian `i` in the order in which they are blended. `sh` are its
-// coefficients (null when plain colours are given). False when one cannot be drawn.
+// coefficients (null when plain colours are given), `direction` is that of the view. False when one
+// cannot be drawn.
 template <typename T>
-GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const Vec3<T>& direction, int64_t i,
                                     int degree, const T* sh, T depth, T* feature) {
   bool good = true;
   if (sh) {
-    const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
-    T length;
-    good = sh_color(degree, view_direction(cam, mean, &length), sh, feature);
+    good = sh_color(degree, direction, sh, feature);
   } else {
     for (int ch = 0; ch < a.channels; ++ch) {
       feature[ch] = a.colors[a.channels * i + ch];
