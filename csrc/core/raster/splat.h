@@ -12,6 +12,12 @@ namespace gsf {
 template <typename T>
 using Flag = decltype(T() < T());
 
+// One of two values; cpu/pack.h has the same by lanes.
+template <typename T>
+GSF_HOST_DEVICE T select(bool where, T yes, T no) {
+  return where ? yes : no;
+}
+
 constexpr double kScreenBlur = 0.3;        // low-pass added to both variances [px^2]
 constexpr double kMinAlpha = 1.0 / 255.0;  // smaller contributions are skipped
 // Cap; no gradient where it binds. A float in double too: two capped splats end a pixel either way.
@@ -82,15 +88,16 @@ GSF_HOST_DEVICE Flag<T> rotation_from_quat(const T* q, Mat3<T>* axes) {
 template <typename T>
 GSF_HOST_DEVICE void rotation_from_quat_backward(const T* q, const Mat3<T>& g, T* grad) {
   using std::sqrt;
+  const T two = T(2);
   const T s = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const T w = s * q[0], x = s * q[1], y = s * q[2], z = s * q[3];
-  const T gw = 2 * (x * (g.m[7] - g.m[5]) + y * (g.m[2] - g.m[6]) + z * (g.m[3] - g.m[1]));
-  const T gx = 2 * (y * (g.m[1] + g.m[3]) + z * (g.m[2] + g.m[6]) + w * (g.m[7] - g.m[5]) -
-                    2 * x * (g.m[4] + g.m[8]));
-  const T gy = 2 * (x * (g.m[1] + g.m[3]) + z * (g.m[5] + g.m[7]) + w * (g.m[2] - g.m[6]) -
-                    2 * y * (g.m[0] + g.m[8]));
-  const T gz = 2 * (x * (g.m[2] + g.m[6]) + y * (g.m[5] + g.m[7]) + w * (g.m[3] - g.m[1]) -
-                    2 * z * (g.m[0] + g.m[4]));
+  const T gw = two * (x * (g.m[7] - g.m[5]) + y * (g.m[2] - g.m[6]) + z * (g.m[3] - g.m[1]));
+  const T gx = two * (y * (g.m[1] + g.m[3]) + z * (g.m[2] + g.m[6]) + w * (g.m[7] - g.m[5]) -
+                      two * x * (g.m[4] + g.m[8]));
+  const T gy = two * (x * (g.m[1] + g.m[3]) + z * (g.m[5] + g.m[7]) + w * (g.m[2] - g.m[6]) -
+                      two * y * (g.m[0] + g.m[8]));
+  const T gz = two * (x * (g.m[2] + g.m[6]) + y * (g.m[5] + g.m[7]) + w * (g.m[3] - g.m[1]) -
+                      two * z * (g.m[0] + g.m[4]));
   const T along = gw * w + gx * x + gy * y + gz * z;
   grad[0] = s * (gw - along * w);
   grad[1] = s * (gx - along * x);
@@ -267,16 +274,15 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
     const T compensation = splat_compensation(f);
     *grad_opacity = g.opacity * compensation;
     const T ratio = f.det0 * inverse;
-    if (ratio > T(kMinCompensation) * T(kMinCompensation)) {
-      d_det0 = g.opacity * opacity * T(0.5) / compensation * inverse;
-      da -= d_det0 * ratio * c;
-      dc -= d_det0 * ratio * a;
-      db += d_det0 * ratio * f.cov_b;
-      if (!shape.scales) {
-        da += d_det0 * f.cov_c;
-        dc += d_det0 * f.cov_a;
-        db -= d_det0 * f.cov_b;
-      }
+    d_det0 = select(ratio > T(kMinCompensation) * T(kMinCompensation),
+                    g.opacity * opacity * T(0.5) / compensation * inverse, T(0));
+    da -= d_det0 * ratio * c;
+    dc -= d_det0 * ratio * a;
+    db += d_det0 * ratio * f.cov_b;
+    if (!shape.scales) {
+      da += d_det0 * f.cov_c;
+      dc += d_det0 * f.cov_a;
+      db -= d_det0 * f.cov_b;
     }
   }
   // The map to the screen, and the covariance times it, in the frame of the shape.
@@ -300,10 +306,11 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
       (*grad_covariance)(i, j) =
           da * mx[i] * mx[j] + db * (mx[i] * my[j] + my[i] * mx[j]) + dc * my[i] * my[j];
   Vec3<T> dmx = T(2) * (da * sx + db * sy), dmy = T(2) * (db * sx + dc * sy);
-  if (shape.scales && d_det0 != T(0)) {
+  if (shape.scales && antialiased) {
     // det0 = sum_k s_i^2 s_j^2 n_k^2 with n = mx x my and i, j the other two: no differences.
-    const Vec3<T> n = cross(mx, my);
-    Vec3<T> dn;
+    Vec3<T> n = cross(mx, my), dn;
+    // infinite of a needle whose part of the gradient is zero
+    for (int k = 0; k < 3; ++k) n[k] = select((d_det0 < T(0)) | (d_det0 > T(0)), n[k], T(0));
     for (int k = 0; k < 3; ++k) {
       const int i = (k + 1) % 3, j = (k + 2) % 3;
       dn[k] = T(2) * d_det0 * square[i] * square[j] * n[k];
@@ -328,14 +335,10 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
   const T du = -cam.fx * f.inverse_z * dot(dmx, r2), dv = -cam.fy * f.inverse_z * dot(dmy, r2);
   d_inverse += g.x * cam.fx * f.point.x + g.y * cam.fy * f.point.y;
   Vec3<T> dp{g.x * cam.fx * f.inverse_z, g.y * cam.fy * f.inverse_z, g.depth};
-  if (f.free_u) {
-    dp.x += du * f.inverse_z;
-    d_inverse += du * f.point.x;
-  }
-  if (f.free_v) {
-    dp.y += dv * f.inverse_z;
-    d_inverse += dv * f.point.y;
-  }
+  dp.x += select(f.free_u, du * f.inverse_z, T(0));
+  d_inverse += select(f.free_u, du * f.point.x, T(0));
+  dp.y += select(f.free_v, dv * f.inverse_z, T(0));
+  d_inverse += select(f.free_v, dv * f.point.y, T(0));
   dp.z -= f.inverse_z * f.inverse_z * d_inverse;
   return matvec(transpose(r), dp);
 }
@@ -349,8 +352,8 @@ GSF_HOST_DEVICE void splat_axes_backward(const Mat3<T>& axes, const T* scales, c
   for (int k = 0; k < 3; ++k) {
     const Vec3<T> h{grad_covariance(0, k), grad_covariance(1, k), grad_covariance(2, k)};
     const Vec3<T> world = matvec(axes, h);  // dSigma/d(axis) = 2 s^2 G axis
-    grad_scales[k] = 2 * scales[k] * h[k];
-    for (int i = 0; i < 3; ++i) grad_axes(i, k) = 2 * scales[k] * scales[k] * world[i];
+    grad_scales[k] = T(2) * scales[k] * h[k];
+    for (int i = 0; i < 3; ++i) grad_axes(i, k) = T(2) * scales[k] * scales[k] * world[i];
   }
   rotation_from_quat_backward(quat, grad_axes, grad_quat);
 }
