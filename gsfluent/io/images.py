@@ -103,7 +103,8 @@ def save_image(image: Tensor, path: str | Path) -> None:
         )
     values = (image.detach().cpu().nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
     with atomic_path(path) as temporary:
-        Image.fromarray(values).save(temporary)
+        # of a PNG: 4 % larger or smaller than by level 6, in less than half of its time
+        Image.fromarray(values).save(temporary, compress_level=3)
 
 
 def load_view(camera: Camera, max_size: int | None = None) -> View:
