@@ -136,7 +136,8 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
         mask = read_mask(camera.mask_path)
     camera = _fitted(camera, image.shape[1], image.shape[0])
     factor = 1.0 if max_size is None else min(1.0, max_size / max(image.shape[:2]))
-    camera = camera.scaled(factor)
+    if factor < 1.0:
+        camera = camera.scaled(factor)
     image = _resize(image, camera.width, camera.height)
     if mask is not None:
         mask = _resize(mask, camera.width, camera.height)
@@ -152,7 +153,7 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
         torch.from_numpy(np.ascontiguousarray(image.clip(0, 1))),
         None if mask is None else torch.from_numpy(np.ascontiguousarray(mask.clip(0, 1))),
         valid,
-        camera.replace(distortion=()),
+        camera.replace(distortion=()) if camera.distortion else camera,
     )
 
 
