@@ -90,6 +90,18 @@ Pack<T> sqrt(Pack<T> x) {
 #endif
 }
 
+template <typename T>
+Pack<T> log(Pack<T> x) {
+  for (int lane = 0; lane < Pack<T>::kLanes; ++lane) x.v[lane] = std::log(x.v[lane]);
+  return x;
+}
+
+// Lanes that are neither infinite nor NaN.
+template <typename T>
+typename Pack<T>::Int finite(Pack<T> x) {
+  return (x - x) == Pack<T>(0);
+}
+
 // Largest lane.
 template <typename T>
 T largest_lane(Pack<T> x) {

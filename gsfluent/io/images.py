@@ -103,7 +103,8 @@ def save_image(image: Tensor, path: str | Path) -> None:
         )
     values = (image.detach().cpu().nan_to_num(0.0).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
     with atomic_path(path) as temporary:
-        Image.fromarray(values).save(temporary)
+        # of a PNG: 4 % larger or smaller than by level 6, in less than half of its time
+        Image.fromarray(values).save(temporary, compress_level=3)
 
 
 def load_view(camera: Camera, max_size: int | None = None) -> View:
@@ -135,7 +136,8 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
         mask = read_mask(camera.mask_path)
     camera = _fitted(camera, image.shape[1], image.shape[0])
     factor = 1.0 if max_size is None else min(1.0, max_size / max(image.shape[:2]))
-    camera = camera.scaled(factor)
+    if factor < 1.0:
+        camera = camera.scaled(factor)
     image = _resize(image, camera.width, camera.height)
     if mask is not None:
         mask = _resize(mask, camera.width, camera.height)
@@ -151,7 +153,7 @@ def load_view(camera: Camera, max_size: int | None = None) -> View:
         torch.from_numpy(np.ascontiguousarray(image.clip(0, 1))),
         None if mask is None else torch.from_numpy(np.ascontiguousarray(mask.clip(0, 1))),
         valid,
-        camera.replace(distortion=()),
+        camera.replace(distortion=()) if camera.distortion else camera,
     )
 
 

@@ -212,9 +212,12 @@ class Solver(SolverState):
             raise ValueError(f"{op}: position must have 1 to {layout.MAX_PARTICLES} rows, got {n}")
         like = velocity
         check_tensor(op, "velocity", velocity, shape=(n, 3))
-        for name, value in (("mass", mass), ("volume", volume)):
+        named = {"mass": mass, "volume": volume}
+        for name, value in named.items():
             check_tensor(op, name, value, shape=(n,), like=like)
-            if not bool(((value > 0) & torch.isfinite(value)).all()):
+        good = [((value > 0) & torch.isfinite(value)).all() for value in named.values()]
+        for name, fine in zip(named, torch.stack(good).tolist(), strict=True):
+            if not fine:
                 raise ValueError(f"{op}: {name} must be positive and finite")
         optional = (
             ("strain", strain, (n, 6)), ("alpha", alpha, (n,)), ("peak", peak, (n,)),

@@ -70,21 +70,35 @@ class Given:
         over = offset >= 1.0
         return (cell + over).long(), offset.masked_fill(over, 0.0)
 
-    def keys(self, part: slice, device: torch.device) -> Tensor:
-        """Block and field of each point in one word, int64 [n]."""
-        block = self.cells(part, device)[0] >> 2
-        return keys(block, 0 if self.body is None else self.body[part].to(device).long())
+    def keys(self, part: slice, cell: Tensor) -> Tensor:
+        """Block and field of each point in one word, int64 [n], by its cell."""
+        return keys(cell >> 2, 0 if self.body is None else self.body[part].to(cell.device).long())
 
     def rows(
-        self, part: slice, b: layout.Buffers, widths: dict[str, int]
+        self,
+        part: slice,
+        cells: tuple[Tensor, Tensor],
+        b: layout.Buffers,
+        widths: dict[str, int],
+        sound: dict[str, Tensor],
     ) -> Iterator[tuple[str, Tensor]]:
         """What is held of each point, name by name.
 
-        Raises:
-            ValueError: A value is not finite.
+        Args:
+            part: Which points.
+            cells: What :meth:`cells` says of them.
+            b: Buffers.
+            widths: What they hold.
+            sound: Gets for every name whether all of its values are finite, bool [].
         """
         device, real = b.offset.device, self.velocity.dtype
-        cell, offset = self.cells(part, device)
+        cell, offset = cells
+
+        def finite(name: str, values: Tensor) -> Tensor:
+            good = torch.isfinite(values).all()
+            sound[name] = good & sound.get(name, good)
+            return values
+
         row = self.row[part].to(device).long()
         local = (cell & 3) + 1
         word = local[:, 0] | local[:, 1] << 3 | local[:, 2] << 6 | row << 9
@@ -120,17 +134,6 @@ class Given:
             yield "peak", torch.where(breaks, peak, torch.full_like(peak, UNBROKEN))
 
 
-def finite(name: str, values: Tensor) -> Tensor:
-    """The values, all of which must be finite.
-
-    Raises:
-        ValueError: One is not.
-    """
-    if not bool(torch.isfinite(values).all()):
-        raise ValueError(f"Solver: {name} must be finite")
-    return values
-
-
 def load(
     b: layout.Buffers, widths: dict[str, int], given: Given, begin: int, end: int, room: int
 ) -> tuple[Tensor, Tensor]:
@@ -146,11 +149,16 @@ def load(
 
     Returns:
         Keys of the homes in ascending order, int64 [H], and how many points each has.
+
+    Raises:
+        ValueError: A value is not finite, or a point too far out.
     """
     device = b.offset.device
     key = torch.empty(end - begin, dtype=torch.int64, device=device)
+    cells = None
     for part in stretches(begin, end):
-        key[part.start - begin : part.stop - begin] = given.keys(part, device)
+        cells = given.cells(part, device)
+        key[part.start - begin : part.stop - begin] = given.keys(part, cells[0])
     key, order = torch.sort(key, stable=True)
     homes, counts = torch.unique_consecutive(key, return_counts=True)
     del key
@@ -158,10 +166,17 @@ def load(
     place[order] = torch.arange(end - begin, dtype=torch.int32, device=device)
     del order
     b.reserve_points(widths, room)
+    sound: dict[str, Tensor] = {}
     for part in stretches(begin, end):
         to = place[part.start - begin : part.stop - begin].long()
-        for name, rows in given.rows(part, b, widths):
+        if cells is None or part != slice(begin, end):  # not those of the only stretch
+            cells = given.cells(part, device)
+        for name, rows in given.rows(part, cells, b, widths, sound):
             layout.put_rows(getattr(b, name), widths[name], to, rows)
+    flags = torch.stack([*sound.values()]).tolist() if sound else []  # a rank may get no points
+    for name, good in zip(sound, flags, strict=True):
+        if not good:
+            raise ValueError(f"Solver: {name} must be finite")
     return homes, counts
 
 

@@ -123,23 +123,13 @@ class SolverState:
 
         Columns after the parameters: ``csrc/core/solver/state.h``.
         """
-        count = self._law.shape[0]
         if material is not None:
             check_tensor("Solver", "material", material, shape=(self.count,), dtype=torch.int32)
-            if not bool(((material >= 0) & (material < count)).all()):
-                raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
-        found: list[Tensor] = []
-        row = torch.empty(self.count, dtype=torch.int32, device=self.outside)
-        for part in points.stretches(0, self.count):
-            facts = [mass.new_zeros(()).expand_as(mass)] if material is None else [material]
-            facts = [fact[part].to(self.device, torch.float64) for fact in (*facts, mass, volume)]
-            unique, index = _unique_rows(torch.stack(facts, dim=1))
-            row[part] = index.to(row) + sum(map(len, found))
-            found.append(unique)
-        if len(found) > 1:
-            unique, number = _unique_rows(torch.cat(found))
-            for part in points.stretches(0, self.count):
-                row[part] = number[row[part].to(self.device).long()].to(row)
+        unique = self._alike(material, mass, volume)
+        if unique is not None:
+            row = mass.new_zeros(self.count, dtype=torch.int32) if material is None else material
+        else:
+            row, unique = self._unlike(material, mass, volume)
         if unique.shape[0] > layout.MAX_ROWS:
             raise ValueError(
                 f"Solver: {unique.shape[0]} different (material, mass, volume), at most "
@@ -153,6 +143,49 @@ class SolverState:
         numbers = torch.cat([unique[:, 1:2], pace[:, None], derived], dim=1)
         rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row, rows.contiguous(), self._law[which].contiguous()
+
+    def _alike(self, material: Tensor | None, mass: Tensor, volume: Tensor) -> Tensor | None:
+        """What :meth:`_unlike` finds, of every row of parameters, without a sort.
+
+        None where points of one row differ, or there are very many. Rows without points have no
+        mass and no volume.
+        """
+        count = self._law.shape[0]
+        if max(self.count, count) > layout.MAX_ROWS:
+            return None
+        facts = torch.stack([mass, volume])
+        if material is None:
+            row, wrong = torch.zeros_like(mass, dtype=torch.int64), mass < 0
+        else:
+            row = material.long().clamp(0, count - 1)
+            wrong = row != material
+        table = facts.new_zeros(2, count).scatter_(1, row.expand(2, -1), facts)
+        differs = (table.gather(1, row.expand(2, -1)) != facts).any(0)
+        if bool((wrong | differs).any()):
+            return None
+        numbers = torch.arange(count, device=table.device, dtype=torch.float64)
+        return torch.cat([numbers[None], table.double()]).T.to(self.device)
+
+    def _unlike(
+        self, material: Tensor | None, mass: Tensor, volume: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The row of each point among the (material, mass, volume) that occur, and these."""
+        count = self._law.shape[0]
+        if material is not None and not bool(((material >= 0) & (material < count)).all()):
+            raise ValueError(f"Solver: material must lie in 0 to {count - 1} (rows of law)")
+        found: list[Tensor] = []
+        row = torch.empty(self.count, dtype=torch.int32, device=self.outside)
+        for part in points.stretches(0, self.count):
+            facts = [mass.new_zeros(()).expand_as(mass)] if material is None else [material]
+            facts = [fact[part].to(self.device, torch.float64) for fact in (*facts, mass, volume)]
+            unique, index = _unique_rows(torch.stack(facts, dim=1))
+            row[part] = index.to(row) + sum(map(len, found))
+            found.append(unique)
+        if len(found) > 1:
+            unique, number = _unique_rows(torch.cat(found))
+            for part in points.stretches(0, self.count):
+                row[part] = number[row[part].to(self.device).long()].to(row)
+        return row, unique
 
     def _damage_scale(self, law: Tensor, rows: Tensor) -> Tensor:
         """Units of the sums of the damage field, by the largest volume, history and stiffness.

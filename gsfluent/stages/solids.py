@@ -30,6 +30,7 @@ from gsfluent.pipeline.render.cuts import save_cut_views
 from gsfluent.pipeline.simulate.stage import QUALITY
 from gsfluent.pipeline.texture import Texture
 from gsfluent.progress import LineReporter, Reporter
+from gsfluent.results.behind import Behind
 from gsfluent.results.record import RunRecord, read_frame
 from gsfluent.results.store import StageStore, content_digest, publish
 from gsfluent.stages.context import RunContext
@@ -202,8 +203,9 @@ def texture_stage(context: RunContext) -> None:
                 seed=context.seed,
             )
             textured = stage(solid, context.capture, progress=context.reporter.task("texture"))
-            save_solid(textured, folder / f"{name}.ply")
-            save_cut_views(textured, folder / f"{name}.png")
+            with Behind() as beside:
+                beside.do(save_solid, textured, folder / f"{name}.ply")
+                save_cut_views(textured, folder / f"{name}.png")
             reports.append({k: v for k, v in textured.report.items() if k != "fill"})
         return _merged(reports)
 

@@ -52,6 +52,22 @@ def test_order_of_gaussians_does_not_matter() -> None:
     assert torch.equal(a.radii[order], b.radii)
 
 
+def test_a_splat_is_the_same_wherever_it_stands_in_a_packet() -> None:
+    inputs = {k: v for k, v in float_scene(21).items() if k != "background"}
+    whole = render(rasterize, inputs)
+    for count in (1, 7, 8, 9):
+        for first in range(21 - count):
+            rows = slice(first, first + count)
+            some = render(rasterize, {k: v[rows] for k, v in inputs.items()})
+            assert torch.equal(some.radii, whole.radii[..., rows])
+            if count == 1:  # the opacity where nothing is before it
+                alone = render(
+                    rasterize, {k: v[rows].repeat_interleave(3, 0) for k, v in inputs.items()}
+                )
+                pair = torch.equal(alone.radii[..., :1].expand_as(alone.radii), alone.radii)
+                assert pair and bool((alone.alpha >= some.alpha).all())
+
+
 def test_contributions_sum_to_alpha() -> None:
     out = render(rasterize, float_scene(200), contribution=True)
     torch.testing.assert_close(out.contribution.sum(), out.alpha.sum(), rtol=1e-5, atol=0)

@@ -100,3 +100,28 @@ def test_values_of_one_look_are_those_of_many() -> None:
     with pytest.raises(InputError, match="deformation"):
         solver.values("position", "deformation")
     assert solver.values() == ()
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+@pytest.mark.parametrize("kind", ["one row", "rows without points", "two masses in a row"])
+def test_rows_found_without_a_sort_move_points_alike(
+    device: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = scene(cells=3, bodies=2, laws=(0, 1), dtype=torch.float32, device=device)
+    if kind == "one row":
+        given |= {"material": None, "law": given["law"][1:], "params": given["params"][1:]}
+    elif kind == "rows without points":
+        given["law"] = given["law"].repeat_interleave(3)
+        given["params"] = given["params"].repeat_interleave(3, 0)
+        given["material"] = 3 * given["material"] + 1
+    else:
+        given["mass"][::2] *= 0.5
+    found = []
+    for sorts in (False, True):
+        if sorts:
+            monkeypatch.setattr(ops.Solver, "_alike", lambda *given: None)
+        solver = ops.Solver(**given)
+        solver.advance(steps=20)
+        found.append(solver.values("position", "velocity", "strain", "alpha"))
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)

@@ -113,7 +113,8 @@ GSF_HOST_DEVICE bool project_geometry(const RasterArgs<T>& a, const SplatCamera<
     splat_frame_axes(axes, a.scales + 3 * i, &frame);
   }
   const T ox = a.offset ? a.offset[2 * row] : T(0), oy = a.offset ? a.offset[2 * row + 1] : T(0);
-  return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s);
+  return splat_finish(cam, frame, a.opacities[i], a.antialiased, ox, oy, s) &&
+         !splat_box(s->x, s->y, s->extent_x, s->extent_y, cam.width, cam.height).empty();
 }
 
 // False for what is not drawn, NaN among it.
@@ -140,15 +141,14 @@ GSF_HOST_DEVICE bool sh_color(int degree, const Vec3<T>& direction, const T* c, 
 }
 
 // Colours, normal and depth of Gaussian `i` in the order in which they are blended. `sh` are its
-// coefficients (null when plain colours are given). False when one cannot be drawn.
+// coefficients (null when plain colours are given), `direction` is that of the view. False when one
+// cannot be drawn.
 template <typename T>
-GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+GSF_HOST_DEVICE bool splat_features(const RasterArgs<T>& a, const Vec3<T>& direction, int64_t i,
                                     int degree, const T* sh, T depth, T* feature) {
   bool good = true;
   if (sh) {
-    const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
-    T length;
-    good = sh_color(degree, view_direction(cam, mean, &length), sh, feature);
+    good = sh_color(degree, direction, sh, feature);
   } else {
     for (int ch = 0; ch < a.channels; ++ch) {
       feature[ch] = a.colors[a.channels * i + ch];
@@ -198,7 +198,7 @@ GSF_HOST_DEVICE void moments_to_gradient(const T* moment, const SplatConic<T>& c
   g[1] = z * moment[0] + y * moment[1];
   g[2] = T(0.5) * x * xx;
   g[3] = T(0.5) * (z * xx + y * xy);
-  g[4] = T(0.5) * (z * z * moment[2] + 2 * y * z * moment[3] + y * yy);
+  g[4] = T(0.5) * (z * z * moment[2] + T(2) * y * z * moment[3] + y * yy);
   g[5] = moment[5] / opacity;
 }
 
@@ -210,35 +210,47 @@ struct GaussianGradient {
   T opacity = T(0);
 };
 
-// Adds what `g` (as from moments_to_gradient; the depth's gradient is `depth`) says of one camera.
-// The splat was visible there, so every input is finite. A part that leaves T's range although `g`
-// did not (a focal length or scale near the end of the range) is left out.
+// Adds what `g` (as from moments_to_gradient; the depth's gradient is `depth`) says of one camera
+// that saw the Gaussian, where `wanted`. Every input is finite then. A part that leaves T's range
+// although `g` did not (a focal length or scale near the end of the range) is left out.
 template <typename T>
-GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
-                                       const T* g, T depth, GaussianGradient<T>* total) {
-  const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
+GSF_HOST_DEVICE void geometry_gradient(const SplatCamera<T>& cam, const Vec3<T>& mean,
+                                       const SplatShape<T>& shape, T opacity, bool antialiased,
+                                       const T* g, T depth, Flag<T> wanted,
+                                       GaussianGradient<T>* total) {
   SplatFrame<T> frame;
-  if (!splat_frame_point(cam, mean, &frame)) return;
-  SplatShape<T> shape{};
-  if (a.covars) {
-    shape.covariance = load_sym3(a.covars + 6 * i);
-    splat_frame_covariance(shape.covariance, &frame);
-  } else {
-    if (!rotation_from_quat(a.quats + 4 * i, &shape.axes)) return;
-    shape.scales = a.scales + 3 * i;
+  wanted = wanted & splat_frame_point(cam, mean, &frame);
+  if (shape.scales)
     splat_frame_axes(shape.axes, shape.scales, &frame);
-  }
+  else
+    splat_frame_covariance(shape.covariance, &frame);
   const SplatGradient<T> pixel{g[0], g[1], g[2], g[3], g[4], g[5], depth};
   Mat3<T> grad_covariance;
   T grad_opacity;
-  const Vec3<T> grad_mean = splat_backward(cam, frame, shape, a.opacities[i], a.antialiased, pixel,
+  const Vec3<T> grad_mean = splat_backward(cam, frame, shape, opacity, antialiased, pixel,
                                            &grad_covariance, &grad_opacity);
   T all = grad_mean.x + grad_mean.y + grad_mean.z + grad_opacity;
   for (int k = 0; k < 9; ++k) all += grad_covariance.m[k];
-  if (!finite(all) && finite(g[0] + g[1] + g[2] + g[3] + g[4] + g[5] + depth)) return;
-  total->mean = total->mean + grad_mean;
-  total->covariance = total->covariance + grad_covariance;
-  total->opacity += grad_opacity;
+  const T given = g[0] + g[1] + g[2] + g[3] + g[4] + g[5] + depth;
+  wanted = wanted & (finite(all) | (finite(given) == Flag<T>{}));
+  for (int k = 0; k < 3; ++k) total->mean[k] += select(wanted, grad_mean[k], T(0));
+  for (int k = 0; k < 9; ++k) total->covariance.m[k] += select(wanted, grad_covariance.m[k], T(0));
+  total->opacity += select(wanted, grad_opacity, T(0));
+}
+
+// The same of Gaussian `i`.
+template <typename T>
+GSF_HOST_DEVICE void geometry_backward(const RasterArgs<T>& a, const SplatCamera<T>& cam, int64_t i,
+                                       const T* g, T depth, GaussianGradient<T>* total) {
+  SplatShape<T> shape{};
+  if (a.covars) {
+    shape.covariance = load_sym3(a.covars + 6 * i);
+  } else {
+    if (!rotation_from_quat(a.quats + 4 * i, &shape.axes)) return;
+    shape.scales = a.scales + 3 * i;
+  }
+  geometry_gradient(cam, load_vec3(a.means + 3 * i), shape, a.opacities[i], a.antialiased, g, depth,
+                    true, total);
 }
 
 // First half of the colour's adjoint: drops the channels of `grad_rgb` that the clamp at zero held,

@@ -1,11 +1,22 @@
 // One Gaussian splat: projection to the screen (EWA), its extent, and the exact adjoint of both.
 // Conventions: quaternion wxyz, view = world->camera with OpenCV axes, pixel centres at +0.5. Every
 // value that must agree between CPU, CUDA and the PyTorch reference is a constant here.
+// What is written without branches also takes packets of splats for T (csrc/cpu/raster/packet.h):
+// a comparison of those is a mask.
 #pragma once
 
 #include "core/raster/sh.h"
 
 namespace gsf {
+
+template <typename T>
+using Flag = decltype(T() < T());
+
+// One of two values; cpu/pack.h has the same by lanes.
+template <typename T>
+GSF_HOST_DEVICE T select(bool where, T yes, T no) {
+  return where ? yes : no;
+}
 
 constexpr double kScreenBlur = 0.3;        // low-pass added to both variances [px^2]
 constexpr double kMinAlpha = 1.0 / 255.0;  // smaller contributions are skipped
@@ -59,18 +70,17 @@ GSF_HOST_DEVICE SplatCamera<T> make_splat_camera(const T* viewmat, const T* intr
   return c;
 }
 
-// Columns of `axes` are the rotated unit axes; returns false for a quaternion without direction.
+// Columns of `axes` are the rotated unit axes; false for a quaternion without direction.
 template <typename T>
-GSF_HOST_DEVICE bool rotation_from_quat(const T* q, Mat3<T>* axes) {
+GSF_HOST_DEVICE Flag<T> rotation_from_quat(const T* q, Mat3<T>* axes) {
   using std::sqrt;
   const T n2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-  if (!(n2 > T(1e-24)) || !finite(n2)) return false;
-  const T s = T(1) / sqrt(n2);
+  const T s = T(1) / sqrt(n2), one = T(1), two = T(2);
   const T w = s * q[0], x = s * q[1], y = s * q[2], z = s * q[3];
-  *axes = {{1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z), 2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y)}};
-  return true;
+  *axes = {{one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
+            two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
+            two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y)}};
+  return (n2 > T(1e-24)) & finite(n2);
 }
 
 // Adjoint of rotation_from_quat: gradient of the axes -> gradient of the raw quaternion, through
@@ -78,15 +88,16 @@ GSF_HOST_DEVICE bool rotation_from_quat(const T* q, Mat3<T>* axes) {
 template <typename T>
 GSF_HOST_DEVICE void rotation_from_quat_backward(const T* q, const Mat3<T>& g, T* grad) {
   using std::sqrt;
+  const T two = T(2);
   const T s = T(1) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const T w = s * q[0], x = s * q[1], y = s * q[2], z = s * q[3];
-  const T gw = 2 * (x * (g.m[7] - g.m[5]) + y * (g.m[2] - g.m[6]) + z * (g.m[3] - g.m[1]));
-  const T gx = 2 * (y * (g.m[1] + g.m[3]) + z * (g.m[2] + g.m[6]) + w * (g.m[7] - g.m[5]) -
-                    2 * x * (g.m[4] + g.m[8]));
-  const T gy = 2 * (x * (g.m[1] + g.m[3]) + z * (g.m[5] + g.m[7]) + w * (g.m[2] - g.m[6]) -
-                    2 * y * (g.m[0] + g.m[8]));
-  const T gz = 2 * (x * (g.m[2] + g.m[6]) + y * (g.m[5] + g.m[7]) + w * (g.m[3] - g.m[1]) -
-                    2 * z * (g.m[0] + g.m[4]));
+  const T gw = two * (x * (g.m[7] - g.m[5]) + y * (g.m[2] - g.m[6]) + z * (g.m[3] - g.m[1]));
+  const T gx = two * (y * (g.m[1] + g.m[3]) + z * (g.m[2] + g.m[6]) + w * (g.m[7] - g.m[5]) -
+                      two * x * (g.m[4] + g.m[8]));
+  const T gy = two * (x * (g.m[1] + g.m[3]) + z * (g.m[5] + g.m[7]) + w * (g.m[2] - g.m[6]) -
+                      two * y * (g.m[0] + g.m[8]));
+  const T gz = two * (x * (g.m[2] + g.m[6]) + y * (g.m[5] + g.m[7]) + w * (g.m[3] - g.m[1]) -
+                      two * z * (g.m[0] + g.m[4]));
   const T along = gw * w + gx * x + gy * y + gz * z;
   grad[0] = s * (gw - along * w);
   grad[1] = s * (gx - along * x);
@@ -110,24 +121,23 @@ struct Splat {
 // What projection and its adjoint share.
 template <typename T>
 struct SplatFrame {
-  Vec3<T> point;          // camera coordinates
-  T inverse_z, u, v;      // 1/z, clamped x/z, y/z
-  bool free_u, free_v;    // clamp not binding
-  Vec3<T> row_x, row_y;   // rows of J R, the 2x3 map of world displacements to pixels
-  T cov_a, cov_b, cov_c;  // screen covariance before the low-pass [px^2]
-  T det0, det;            // determinants before and after the low-pass
+  Vec3<T> point;           // camera coordinates
+  T inverse_z, u, v;       // 1/z, clamped x/z, y/z
+  Flag<T> free_u, free_v;  // clamp not binding
+  Vec3<T> row_x, row_y;    // rows of J R, the 2x3 map of world displacements to pixels
+  T cov_a, cov_b, cov_c;   // screen covariance before the low-pass [px^2]
+  T det0, det;             // determinants before and after the low-pass
 };
 
+// False for a point that is not in front of the camera, or not finite.
 template <typename T>
-GSF_HOST_DEVICE bool splat_frame_point(const SplatCamera<T>& cam, const Vec3<T>& mean,
-                                       SplatFrame<T>* f) {
+GSF_HOST_DEVICE Flag<T> splat_frame_point(const SplatCamera<T>& cam, const Vec3<T>& mean,
+                                          SplatFrame<T>* f) {
   f->point = matvec(cam.rotation, mean) + cam.translation;
-  // Written so that NaN fails.
-  if (!(f->point.z >= cam.near && f->point.z <= cam.far)) return false;
   f->inverse_z = T(1) / f->point.z;
   const T u = f->point.x * f->inverse_z, v = f->point.y * f->inverse_z;
-  f->free_u = u >= cam.low_u && u <= cam.high_u;
-  f->free_v = v >= cam.low_v && v <= cam.high_v;
+  f->free_u = (u >= cam.low_u) & (u <= cam.high_u);
+  f->free_v = (v >= cam.low_v) & (v <= cam.high_v);
   f->u = clamp(u, cam.low_u, cam.high_u);
   f->v = clamp(v, cam.low_v, cam.high_v);
   const Mat3<T>& r = cam.rotation;
@@ -136,7 +146,7 @@ GSF_HOST_DEVICE bool splat_frame_point(const SplatCamera<T>& cam, const Vec3<T>&
     f->row_x[j] = sx * (r(0, j) - f->u * r(2, j));
     f->row_y[j] = sy * (r(1, j) - f->v * r(2, j));
   }
-  return true;
+  return (f->point.z >= cam.near) & (f->point.z <= cam.far);
 }
 
 // det(cov + blur I) written as a sum of non-negative terms: no cancellation for needles.
@@ -207,32 +217,29 @@ GSF_HOST_DEVICE T splat_cutoff(T opacity) {
   return min(log(opacity * T(255)), T(kMaxPower));
 }
 
-// Last step of projection; false when the splat cannot be seen or is not a finite splat.
-// `offset_x`, `offset_y` [px] move the centre.
+// Last step of projection; false for what is not a finite splat, or too faint. Whether its box
+// touches the image is for the caller. `offset_x`, `offset_y` [px] move the centre.
 template <typename T>
-GSF_HOST_DEVICE bool splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>& f, T opacity,
-                                  bool antialiased, T offset_x, T offset_y, Splat<T>* s) {
+GSF_HOST_DEVICE Flag<T> splat_finish(const SplatCamera<T>& cam, const SplatFrame<T>& f, T opacity,
+                                     bool antialiased, T offset_x, T offset_y, Splat<T>* s) {
   using std::sqrt;
-  if (!(f.det > T(0)) || !finite(f.det) || !(f.cov_a >= T(0)) || !(f.cov_c >= T(0))) return false;
-  const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur);
-  if (!(a <= T(kMaxVariance) && c <= T(kMaxVariance))) return false;
-  const T inverse = T(1) / f.det;
+  const T a = f.cov_a + T(kScreenBlur), c = f.cov_c + T(kScreenBlur), inverse = T(1) / f.det;
   s->a = c * inverse;
   s->b = -f.cov_b * inverse;
   s->c = a * inverse;
   s->opacity = antialiased ? opacity * splat_compensation(f) : opacity;
-  if (!(s->opacity >= T(kMinAlpha)) || !finite(s->opacity)) return false;
   s->cutoff = splat_cutoff(s->opacity);
   s->x = cam.fx * f.point.x * f.inverse_z + cam.cx + offset_x;
   s->y = cam.fy * f.point.y * f.inverse_z + cam.cy + offset_y;
-  s->extent_x = sqrt(2 * max(s->cutoff, T(0)) * a);
-  s->extent_y = sqrt(2 * max(s->cutoff, T(0)) * c);
+  s->extent_x = sqrt(T(2) * max(s->cutoff, T(0)) * a);
+  s->extent_y = sqrt(T(2) * max(s->cutoff, T(0)) * c);
   s->cov_c = c;
   s->depth = f.point.z;
-  if (!finite(s->x) || !finite(s->y) || !finite(s->a) || !finite(s->b) || !finite(s->c))
-    return false;
-  if (!(s->a > T(0)) || !(s->c > T(0))) return false;
-  return !splat_box(s->x, s->y, s->extent_x, s->extent_y, cam.width, cam.height).empty();
+  // Written so that NaN fails.
+  return (f.det > T(0)) & finite(f.det) & (f.cov_a >= T(0)) & (f.cov_c >= T(0)) &
+         (a <= T(kMaxVariance)) & (c <= T(kMaxVariance)) & (s->opacity >= T(kMinAlpha)) &
+         finite(s->opacity) & finite(s->x) & finite(s->y) & finite(s->a) & finite(s->b) &
+         finite(s->c) & (s->a > T(0)) & (s->c > T(0));
 }
 
 // Gradients that reach a splat from the pixels; those of the covariance are entries of the
@@ -267,16 +274,15 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
     const T compensation = splat_compensation(f);
     *grad_opacity = g.opacity * compensation;
     const T ratio = f.det0 * inverse;
-    if (ratio > T(kMinCompensation) * T(kMinCompensation)) {
-      d_det0 = g.opacity * opacity * T(0.5) / compensation * inverse;
-      da -= d_det0 * ratio * c;
-      dc -= d_det0 * ratio * a;
-      db += d_det0 * ratio * f.cov_b;
-      if (!shape.scales) {
-        da += d_det0 * f.cov_c;
-        dc += d_det0 * f.cov_a;
-        db -= d_det0 * f.cov_b;
-      }
+    d_det0 = select(ratio > T(kMinCompensation) * T(kMinCompensation),
+                    g.opacity * opacity * T(0.5) / compensation * inverse, T(0));
+    da -= d_det0 * ratio * c;
+    dc -= d_det0 * ratio * a;
+    db += d_det0 * ratio * f.cov_b;
+    if (!shape.scales) {
+      da += d_det0 * f.cov_c;
+      dc += d_det0 * f.cov_a;
+      db -= d_det0 * f.cov_b;
     }
   }
   // The map to the screen, and the covariance times it, in the frame of the shape.
@@ -300,10 +306,11 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
       (*grad_covariance)(i, j) =
           da * mx[i] * mx[j] + db * (mx[i] * my[j] + my[i] * mx[j]) + dc * my[i] * my[j];
   Vec3<T> dmx = T(2) * (da * sx + db * sy), dmy = T(2) * (db * sx + dc * sy);
-  if (shape.scales && d_det0 != T(0)) {
+  if (shape.scales && antialiased) {
     // det0 = sum_k s_i^2 s_j^2 n_k^2 with n = mx x my and i, j the other two: no differences.
-    const Vec3<T> n = cross(mx, my);
-    Vec3<T> dn;
+    Vec3<T> n = cross(mx, my), dn;
+    // infinite of a needle whose part of the gradient is zero
+    for (int k = 0; k < 3; ++k) n[k] = select((d_det0 < T(0)) | (d_det0 > T(0)), n[k], T(0));
     for (int k = 0; k < 3; ++k) {
       const int i = (k + 1) % 3, j = (k + 2) % 3;
       dn[k] = T(2) * d_det0 * square[i] * square[j] * n[k];
@@ -328,14 +335,10 @@ GSF_HOST_DEVICE Vec3<T> splat_backward(const SplatCamera<T>& cam, const SplatFra
   const T du = -cam.fx * f.inverse_z * dot(dmx, r2), dv = -cam.fy * f.inverse_z * dot(dmy, r2);
   d_inverse += g.x * cam.fx * f.point.x + g.y * cam.fy * f.point.y;
   Vec3<T> dp{g.x * cam.fx * f.inverse_z, g.y * cam.fy * f.inverse_z, g.depth};
-  if (f.free_u) {
-    dp.x += du * f.inverse_z;
-    d_inverse += du * f.point.x;
-  }
-  if (f.free_v) {
-    dp.y += dv * f.inverse_z;
-    d_inverse += dv * f.point.y;
-  }
+  dp.x += select(f.free_u, du * f.inverse_z, T(0));
+  d_inverse += select(f.free_u, du * f.point.x, T(0));
+  dp.y += select(f.free_v, dv * f.inverse_z, T(0));
+  d_inverse += select(f.free_v, dv * f.point.y, T(0));
   dp.z -= f.inverse_z * f.inverse_z * d_inverse;
   return matvec(transpose(r), dp);
 }
@@ -349,8 +352,8 @@ GSF_HOST_DEVICE void splat_axes_backward(const Mat3<T>& axes, const T* scales, c
   for (int k = 0; k < 3; ++k) {
     const Vec3<T> h{grad_covariance(0, k), grad_covariance(1, k), grad_covariance(2, k)};
     const Vec3<T> world = matvec(axes, h);  // dSigma/d(axis) = 2 s^2 G axis
-    grad_scales[k] = 2 * scales[k] * h[k];
-    for (int i = 0; i < 3; ++i) grad_axes(i, k) = 2 * scales[k] * scales[k] * world[i];
+    grad_scales[k] = T(2) * scales[k] * h[k];
+    for (int i = 0; i < 3; ++i) grad_axes(i, k) = T(2) * scales[k] * scales[k] * world[i];
   }
   rotation_from_quat_backward(quat, grad_axes, grad_quat);
 }

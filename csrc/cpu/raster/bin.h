@@ -8,7 +8,7 @@
 #include <numeric>
 #include <vector>
 
-#include "cpu/raster/row.h"
+#include "cpu/raster/packet.h"
 #include "torch_api.h"
 
 namespace gsf::raster_cpu {
@@ -81,12 +81,12 @@ class TileLists {
       : a_(a),
         depth_(new T[static_cast<size_t>(a.splat_count())]),
         box_(new TileBox[static_cast<size_t>(a.splat_count())]) {
-    const std::vector<SplatCamera<T>> cameras = raster_cameras(a);
+    std::vector<SplatCamera<cpu::Pack<T>>> cameras;
+    for (const SplatCamera<T>& camera : raster_cameras(a)) cameras.push_back(packed(camera));
     const Parts parts(a.splat_count(), 512);
     std::vector<int64_t> first(static_cast<size_t>(parts.count), 0);
-    parts.run([&](int64_t p, int64_t begin, int64_t end) {
-      for (int64_t s = begin; s < end; ++s) first[p] += project(cameras[s / a.count], s);
-    });
+    parts.run(
+        [&](int64_t p, int64_t begin, int64_t end) { first[p] = project(cameras, begin, end); });
     for (int64_t& f : first) total_ += std::exchange(f, total_);
     if (total_ > INT32_MAX) return;  // the host refuses them
     parts.run([&](int64_t p, int64_t begin, int64_t end) {
@@ -136,22 +136,18 @@ class TileLists {
   }
 
  private:
-  // Returns the number of tiles.
-  int64_t project(const SplatCamera<T>& camera, int64_t s) {
-    const int64_t i = s % a_.count;
-    T* row = a_.splats + s * a_.stride;
-    Splat<T> splat;
-    const T* sh = a_.sh ? a_.sh + 3 * sh_coefficients(a_.sh_degree) * i : nullptr;
-    const bool seen = project_geometry(a_, camera, i, s, &splat) &&
-                      splat_features(a_, camera, i, a_.sh_degree, sh, splat.depth, row + kFeatures);
-    if (seen)
-      std::fill(row + kFeatures + a_.features, row + a_.stride, T(0));
-    else
-      std::fill_n(row, a_.stride, T(0));
-    box_[s] = seen ? store_splat(a_, splat, row) : TileBox{0, 0, 0, 0};
-    depth_[s] = seen ? splat.depth : T(0);
-    a_.radii[s] = seen ? splat_radius(splat) : 0;
-    return box_[s].count();
+  // Splats [begin, end), packets of one camera each. Returns the number of tiles.
+  int64_t project(const std::vector<SplatCamera<cpu::Pack<T>>>& cameras, int64_t begin,
+                  int64_t end) {
+    int64_t tiles = 0;
+    for (int64_t s = begin, used; s < end; s += used) {
+      const int64_t camera = s / a_.count, first = s % a_.count;
+      used = std::min<int64_t>({kPacket<T>, end - s, a_.count - first});
+      tiles += project_packet(a_, cameras[camera],
+                              PacketRows<T>{first, a_.count, static_cast<int>(used)}, s, box_.get(),
+                              depth_.get());
+    }
+    return tiles;
   }
 
   // The visible splats of camera `c`, (key << 32 | splat), nearest first; equal depths keep the

@@ -10,6 +10,7 @@
 #include <cstdlib>
 #include <new>
 
+#include "cpu/raster/packet.h"
 #include "cpu/raster/tile.h"
 
 namespace gsf::raster_cpu {
@@ -182,55 +183,129 @@ void clear_gradient(const RasterGradArgs<T>& b, int64_t i) {
   clear(b.grad_normals, a.vectors);
 }
 
-// Sums the rows of Gaussian `i` camera by camera, turns moments into gradients of the projected
-// splat and takes those to the inputs.
+// Gradients of scales and quaternions from those of covariances; what leaves T's range although
+// that did not is zero.
 template <typename T>
-void gaussian_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera<T>>& cameras,
-                       int64_t i, const GradSlots<T>& slots) {
+void store_axes_gradients(const RasterGradArgs<T>& b, const PacketRows<T>& rows, uint32_t any,
+                          const Mat3<cpu::Pack<T>>& covariance) {
+  using P = cpu::Pack<T>;
+  P quat[4], scales[3], grad_scales[3], grad_quat[4], all(0), given(0);
+  rows.template columns<4>(b.forward.quats, quat);
+  rows.template columns<3>(b.forward.scales, scales);
+  Mat3<P> axes;
+  auto good = rotation_from_quat(quat, &axes);
+  splat_axes_backward(axes, scales, quat, covariance, grad_scales, grad_quat);
+  for (const P& g : grad_scales) all += g;
+  for (const P& g : grad_quat) all += g;
+  for (const P& g : covariance.m) given += g;
+  good &= finite(all) | (finite(given) == typename P::Int{});
+  const uint32_t kept = any & cpu::mask_bits(good);
+  for (int lane = 0; lane < rows.used; ++lane) {
+    if (!(kept >> lane & 1)) continue;
+    const int64_t i = rows.first + lane;
+    for (int k = 0; k < 3; ++k) b.grad_scales[3 * i + k] = grad_scales[k][lane];
+    for (int k = 0; k < 4; ++k) b.grad_quats[4 * i + k] = grad_quat[k][lane];
+  }
+}
+
+// Sums the rows of a packet of Gaussians camera by camera, turns moments into gradients of the
+// projected splats and takes those to the inputs.
+template <typename T>
+void packet_backward(const RasterGradArgs<T>& b, const std::vector<SplatCamera<T>>& cameras,
+                     const PacketRows<T>& rows, const GradSlots<T>& slots) {
+  using P = cpu::Pack<T>;
+  constexpr int kLanes = kPacket<T>, kMost = kGradFeatures + kMaxFeatures + 2;
   const RasterArgs<T>& a = b.forward;
-  clear_gradient(b, i);
-  GaussianGradient<T> total;
-  bool any = false;
+  for (int lane = 0; lane < rows.used; ++lane) clear_gradient(b, rows.first + lane);
+  GaussianGradient<P> total;
+  uint32_t any = 0;
   for (int camera = 0; camera < a.cameras; ++camera) {
-    const int64_t s = camera * a.count + i;
-    const int64_t begin = a.order[s],
-                  end = s + 1 < a.splat_count() ? int64_t(a.order[s + 1]) : a.instance_count;
-    T sum[kGradFeatures + kMaxFeatures + 2] = {};
-    for (int64_t slot = begin; slot < end; ++slot)
-      for (int k = 0; k < slots.width; ++k) sum[k] += slots.row(slot)[k];
-    bool seen = false;
-    for (int k = 0; k < slots.width; ++k) seen = seen || sum[k] != T(0);
-    T g[kGradFeatures] = {};
-    if (seen) {
-      const T* row = a.splats + s * a.stride;
-      const SplatConic<T> conic{row[kAcross], row[kSlope], row[kDown]};
-      moments_to_gradient(sum, conic, std::exp2(row[kLogOpacity]), g);
-    }
-    if (b.grad_offset) std::copy_n(g, 2, b.grad_offset + 2 * s);
-    if (b.grad_absolute) {
-      const T* absolute = sum + slots.width - 2;
-      std::copy_n(absolute, 2, b.grad_absolute + 2 * s);
+    T sum[kLanes][kMost];
+    uint32_t seen = 0;
+    for (int lane = 0; lane < rows.used; ++lane) {
+      const int64_t s = camera * a.count + rows.first + lane;
+      const int64_t begin = a.order[s],
+                    end = s + 1 < a.splat_count() ? int64_t(a.order[s + 1]) : a.instance_count;
+      std::fill_n(sum[lane], slots.width, T(0));
+      for (int64_t slot = begin; slot < end; ++slot)
+        for (int k = 0; k < slots.width; ++k) sum[lane][k] += slots.row(slot)[k];
+      bool some = false;
+      for (int k = 0; k < slots.width; ++k) some = some || sum[lane][k] != T(0);
+      seen |= static_cast<uint32_t>(some) << lane;
+      if (b.grad_absolute) std::copy_n(sum[lane] + slots.width - 2, 2, b.grad_absolute + 2 * s);
+      if (b.grad_offset) std::fill_n(b.grad_offset + 2 * s, 2, T(0));
     }
     if (!seen) continue;
-    any = true;
-    T* feature = sum + kGradFeatures;
-    const T depth = b.grad_depth ? feature[slots.active - 1] : T(0);
-    geometry_backward(a, cameras[camera], i, g, depth, &total);
-    if (a.sh) {
-      const int64_t at = 3 * sh_coefficients(a.sh_degree) * i;
-      const Vec3<T> mean{a.means[3 * i], a.means[3 * i + 1], a.means[3 * i + 2]};
-      if (slots.active >= 3)
-        sh_backward(a.sh_degree, cameras[camera], mean, a.sh + at, feature, b.grad_sh + at,
-                    &total.mean);
+    any |= seen;
+    const auto of = [&](const auto& f) {
+      return cpu::pack_of<T>([&](int lane) { return seen >> lane & 1 ? f(lane) : T(0); });
+    };
+    const int64_t first = camera * a.count + rows.first;
+    const auto header = [&](int field) {
+      return of([&](int lane) { return a.splats[(first + lane) * a.stride + field]; });
+    };
+    P moment[kGradFeatures], g[kGradFeatures];
+    for (int k = 0; k < kGradFeatures; ++k) moment[k] = of([&](int lane) { return sum[lane][k]; });
+    const SplatConic<P> conic{header(kAcross), header(kSlope), header(kDown)};
+    const P opacity =
+        of([&](int lane) { return std::exp2(a.splats[(first + lane) * a.stride + kLogOpacity]); });
+    moments_to_gradient(moment, conic, opacity, g);
+    if (b.grad_offset)
+      for (int lane = 0; lane < rows.used; ++lane)
+        if (seen >> lane & 1)
+          for (int k = 0; k < 2; ++k) b.grad_offset[2 * (first + lane) + k] = g[k][lane];
+    const P depth = b.grad_depth
+                        ? of([&](int lane) { return sum[lane][kGradFeatures + slots.active - 1]; })
+                        : P(0);
+    P mean[3], scales[3], quat[4];
+    rows.template columns<3>(a.means, mean);
+    SplatShape<P> shape{};
+    auto wanted = of([](int) { return T(1); }) > P(0);
+    if (a.covars) {
+      P c[6];
+      for (int k = 0; k < 6; ++k)
+        c[k] = cpu::pack_of<T>([&](int lane) { return a.covars[6 * rows.row(lane) + k]; });
+      shape.covariance = {c[0], c[1], c[2], c[3], c[4], c[5]};
     } else {
-      for (int c = 0; c < std::min(a.channels, slots.active); ++c)
-        b.grad_colors[a.channels * i + c] += feature[c];
+      rows.template columns<4>(a.quats, quat);
+      rows.template columns<3>(a.scales, scales);
+      wanted &= rotation_from_quat(quat, &shape.axes);
+      shape.scales = scales;
     }
-    if (slots.active >= a.channels + a.vectors)
-      for (int k = 0; k < a.vectors; ++k)
-        b.grad_normals[a.vectors * i + k] += feature[a.channels + k];
+    geometry_gradient(packed(cameras[camera]), Vec3<P>{mean[0], mean[1], mean[2]}, shape,
+                      rows.column(a.opacities), a.antialiased, g, depth, wanted, &total);
+    for (int lane = 0; lane < rows.used; ++lane) {
+      if (!(seen >> lane & 1)) continue;
+      const int64_t i = rows.first + lane;
+      T* feature = sum[lane] + kGradFeatures;
+      if (a.sh) {
+        const int64_t at = 3 * sh_coefficients(a.sh_degree) * i;
+        Vec3<T> part{T(0), T(0), T(0)};
+        if (slots.active >= 3)
+          sh_backward(a.sh_degree, cameras[camera], load_vec3(a.means + 3 * i), a.sh + at, feature,
+                      b.grad_sh + at, &part);
+        for (int k = 0; k < 3; ++k) total.mean[k].v[lane] += part[k];
+      } else {
+        for (int c = 0; c < std::min(a.channels, slots.active); ++c)
+          b.grad_colors[a.channels * i + c] += feature[c];
+      }
+      if (slots.active >= a.channels + a.vectors)
+        for (int k = 0; k < a.vectors; ++k)
+          b.grad_normals[a.vectors * i + k] += feature[a.channels + k];
+    }
   }
-  if (any) store_gaussian_gradient(b, i, total);
+  if (!any) return;
+  for (int lane = 0; lane < rows.used; ++lane) {
+    if (!(any >> lane & 1)) continue;
+    const int64_t i = rows.first + lane;
+    for (int k = 0; k < 3; ++k) b.grad_means[3 * i + k] = total.mean[k][lane];
+    b.grad_opacities[i] = total.opacity[lane];
+    // The six numbers stand for the full symmetric matrix: off-diagonal entries count twice.
+    constexpr int kEntry[6] = {0, 4, 8, 1, 2, 5};
+    for (int k = 0; k < 6 && a.covars; ++k)
+      b.grad_covars[6 * i + k] = T(k < 3 ? 1 : 2) * total.covariance.m[kEntry[k]][lane];
+  }
+  if (!a.covars) store_axes_gradients(b, rows, any, total.covariance);
 }
 
 }  // namespace gsf::raster_cpu

@@ -107,7 +107,10 @@ struct RasterCpu {
     // In the order of the inputs, where all memory is sequential.
     const std::vector<SplatCamera<T>> cameras = raster_cameras(a);
     parallel_for(a.count, 512, [&](int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) gaussian_backward(b, cameras, i, slots);
+      for (int64_t i = begin; i < end; i += kPacket<T>)
+        packet_backward(b, cameras,
+                        PacketRows<T>{i, a.count, int(std::min<int64_t>(kPacket<T>, end - i))},
+                        slots);
     });
   }
 };

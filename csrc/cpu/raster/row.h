@@ -47,24 +47,4 @@ inline TileBox load_box(const T* row) {
   return box;
 }
 
-// Writes the header and returns the tiles.
-template <typename T>
-inline TileBox store_splat(const RasterArgs<T>& a, const Splat<T>& s, T* row) {
-  const PixelBox tiles =
-      tile_box(splat_box(s.x, s.y, s.extent_x, s.extent_y, a.width, a.height), kTileEdge);
-  const auto narrow = [](int v) { return static_cast<uint16_t>(v); };
-  const TileBox box{narrow(tiles.x0), narrow(tiles.y0), narrow(tiles.x1), narrow(tiles.y1)};
-  const SplatConic<T> conic = SplatConic<T>::of(s);
-  row[kX] = s.x;
-  row[kY] = s.y;
-  row[kAcross] = conic.across;
-  row[kInverseAcross] = T(1) / conic.across;
-  row[kSlope] = conic.slope;
-  row[kDown] = conic.down;
-  row[kLogOpacity] = std::log2(s.opacity);
-  row[kReach] = T(kLog2E) * s.cutoff;
-  std::memcpy(row + kBox, &box, sizeof box);
-  return box;
-}
-
 }  // namespace gsf::raster_cpu

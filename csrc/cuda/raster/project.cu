@@ -23,9 +23,13 @@ __global__ void __launch_bounds__(kRowThreads) project_kernel(RasterArgs<T> a, R
     degree = kDegree;
     sh = row;
   }
-  if (seen)
-    seen =
-        splat_features(a, camera, i, degree, sh, s.depth, splat_feature_rows(a) + m * a.features);
+  if (seen) {
+    T length;
+    Vec3<T> direction{};
+    if (sh) direction = view_direction(camera, load_vec3(a.means + 3 * i), &length);
+    seen = splat_features(a, direction, i, degree, sh, s.depth,
+                          splat_feature_rows(a) + m * a.features);
+  }
   uint64_t code = 0;
   if (i < a.count) {
     SplatGeometry<T> g{};

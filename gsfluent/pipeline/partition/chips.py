@@ -86,20 +86,18 @@ def _between(
     count = [box.numel() for box in boxes]
     owner = torch.repeat_interleave(torch.tensor(count, device=device))
     row = torch.tensor(slots, device=device)[owner]
-    middle, normal, reach = (part[row] for part in planes)
+    normals = planes[1]
+    middle, reach = planes[0][row], planes[2][row]
     first = torch.tensor([0, *itertools.accumulate(count)][:-1], device=device)
     within = torch.arange(sum(count), device=device) - first[owner]
     low = torch.tensor([low for low, _ in spans], device=device)[owner]
     _, m, n = torch.tensor([box.shape for box in boxes], device=device)[owner].unbind(dim=1)
     place = torch.stack([within // (m * n), within // n % m, within % n], dim=1) + low
-    axes = (place.double() - middle).unbind(dim=1)
-    out = []
-    for plane in range(len(_PLANES)):
-        x, y, z = (a * normal[:, plane, axis] for axis, a in enumerate(axes))
-        out.append((x + y) + z)
-    gauge = out[0] / reach[:, 0]
-    for plane in range(1, len(_PLANES)):
-        gauge = torch.maximum(gauge, out[plane] / reach[:, plane])
+    # distances from the middle along the normals of all planes, one product and one sum at a time
+    away = place.double() - middle
+    x, y, z = (away[:, axis, None] * normals[..., axis][row] for axis in range(3))
+    out = (x + y) + z
+    gauge = (out / reach).amax(dim=1)
     label = torch.cat([box.reshape(-1) for box in boxes])
     mine = label == torch.tensor(labels, device=device)[owner]
     many = torch.bincount(owner[mine], minlength=len(labels)).tolist()
@@ -107,9 +105,7 @@ def _between(
     size = torch.stack(
         [part.kthvalue(k).values for part, k in zip(gauge.split(count), many, strict=True)]
     )[owner]
-    sheet = size * reach[:, 0] - out[0]
-    for plane in range(1, len(_PLANES)):
-        sheet = torch.minimum(sheet, size * reach[:, plane] - out[plane])
+    sheet = (size[:, None] * reach - out).amin(dim=1)
     share = (0.5 + sheet / (2.0 * per_spacing)).clamp(min=0.0).to(torch.float32)
     share = torch.where(mine, share.clamp(min=LEAST), share)
     return [

@@ -221,25 +221,17 @@ def join_islands(labels: Labels, near: Tensor, dust: int = -1) -> Labels:
     row[flat] = torch.arange(count, dtype=torch.int32, device=device)
     values = first.reshape(-1)
     own = values[flat].long()
-    a, b = [], []
-    rooted = torch.zeros(count, dtype=torch.bool, device=device)
-    touch: list[tuple[Tensor, Tensor]] = []
-    for axis in range(3):
-        stride = (shape[1] * shape[2], shape[2], 1)[axis]
-        for side in (-1, 1):
-            at = near[:, axis] + side
-            rows = ((at >= 0) & (at < shape[axis])).nonzero()[:, 0]
-            beside = flat[rows] + side * stride
-            other = values[beside].long()
-            same, link = other == own[rows], row[beside].long()
-            if side > 0:
-                joined = same & (link >= 0)
-                a.append(rows[joined])
-                b.append(link[joined])
-            rooted[rows[same & (link < 0)]] = True
-            foreign = ~same & (other >= 0)
-            touch.append((rows[foreign], other[foreign]))
-    root = components(torch.cat(a), torch.cat(b), count)
+    # all six sides of all voxels at once, those of higher numbers first
+    sides = torch.cat([torch.eye(3), -torch.eye(3)]).to(device, torch.int64)
+    at = near + sides[:, None]
+    there = ((at >= 0) & (at < torch.tensor(shape, device=device))).all(dim=2)
+    strides = torch.tensor([shape[1] * shape[2], shape[2], 1], device=device)
+    beside = torch.where(there, flat + (sides * strides).sum(dim=1)[:, None], 0)
+    other, link = values[beside].long(), row[beside].long()
+    same = there & (other == own)
+    rooted = (same & (link < 0)).any(dim=0)
+    axis, joined = (same & (link >= 0))[:3].nonzero().unbind(dim=1)
+    root = components(joined, link[axis, joined], count)
     size = torch.bincount(root, minlength=count)
     safe = torch.zeros(count, dtype=torch.int64, device=device).index_add(0, root, rooted.long())
     many = int(values.max()) + 1
@@ -250,12 +242,10 @@ def join_islands(labels: Labels, near: Tensor, dust: int = -1) -> Labels:
         island &= own != dust
     if not bool(island.any()):
         return labels
-    rows = torch.cat([r for r, _ in touch])
-    other = torch.cat([o for _, o in touch])
-    kept = island[rows]
+    side, rows = (there & ~same & (other >= 0) & island).nonzero().unbind(dim=1)
     lump, slot = torch.unique(root[island], return_inverse=True)
-    beside = torch.searchsorted(lump, root[rows[kept]])
-    faces = torch.bincount(beside * many + other[kept], minlength=len(lump) * many)
+    lumps = torch.searchsorted(lump, root[rows])
+    faces = torch.bincount(lumps * many + other[side, rows], minlength=len(lump) * many)
     faces = faces.view(len(lump), many)
     most = faces.amax(dim=1, keepdim=True)
     # of what touches as many, the lowest

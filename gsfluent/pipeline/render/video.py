@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsfluent.errors import InputError, RunError
 from gsfluent.io import atomic_path
+from gsfluent.results.behind import Behind
 
 # Constant rate factor of x264: 18 is the usual "visually lossless" setting, and splat noise
 # punishes higher ones.
@@ -66,14 +67,15 @@ def write_video(
         )
         try:
             writer.send(None)
-            for frame in frames:
-                if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
-                    raise InputError(
-                        f"video frame {count}: {frame.dtype} {frame.shape}",
-                        f"give uint8 ({height}, {width}, 3)",
-                    )
-                writer.send(frame)
-                count += 1
+            with Behind() as encoder:  # whose pipe holds less than a frame
+                for frame in frames:
+                    if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
+                        raise InputError(
+                            f"video frame {count}: {frame.dtype} {frame.shape}",
+                            f"give uint8 ({height}, {width}, 3)",
+                        )
+                    encoder.do(writer.send, frame)
+                    count += 1
         except OSError as error:
             raise _encoder_stopped(path) from error
         finally:

@@ -7,6 +7,7 @@ material washes out.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -165,11 +166,20 @@ def _draw(
 
 def _halton(count: int, base: int) -> np.ndarray:
     """Radical inverses of 1 to ``count - 1`` in a base."""
+    digits = 0
+    while base**digits < count:
+        digits += 1
+    return _inverses(base, digits)[1:count]
+
+
+@functools.lru_cache(maxsize=4)
+def _inverses(base: int, digits: int) -> np.ndarray:
+    """Radical inverses of all numbers of so many digits."""
     found, fraction = np.zeros(1), 1.0 / base
-    while len(found) < count:  # those with a digit more
+    for _ in range(digits):  # those with a digit more
         found = np.concatenate([found + fraction * digit for digit in range(base)])
         fraction /= base
-    return found[1:count]
+    return found
 
 
 def _turned(patches: Tensor, turn: Tensor) -> Tensor:
