@@ -45,9 +45,8 @@ HEADINGS = {
     "bending": (
         "## Three-point bending\n\n"
         "Miehe et al. 2010: 8 x 2 mm, notch of 0.4 mm, E 20.8 GPa, $G_c$ 500 J/m², l 0.06 mm, "
-        "AT2. Reference: finite elements of our own (`elements.py`), bilinear, quasi-static. Here "
-        "the notch is three cells wide and blunt, and the load rises in five periods of the beam, "
-        "so that the force swings by a tenth about its mean; both lie above 5 %."
+        "AT2. Reference: finite elements of our own (`elements.py`), bilinear, quasi-static, with "
+        "the notch and the bars of each grid."
     ),
     "compact": (
         "## Compact compression\n\n"
