@@ -163,6 +163,13 @@ STABLE_TORCH_LIBRARY(gsfluent, m) {
   m.def("components(Tensor links, int count, Tensor? apart, Tensor? inside) -> Tensor");
   m.def("nearest_seeds(Tensor links, Tensor cost, Tensor key, Tensor other) -> Tensor");
 
+  // --- texture: quantiles of many distributions, and votes of patches ---
+  m.def("rows_between(Tensor ordered, Tensor low, Tensor high, Tensor share) -> Tensor");
+  m.def("quantile_shift(Tensor values, Tensor have, Tensor want) -> Tensor");
+  m.def(
+      "patch_votes(Tensor center, Tensor offset, Tensor best, Tensor patches, Tensor weight, "
+      "Tensor falloff, Tensor(a!) total, Tensor(b!) share) -> ()");
+
   // --- shade: light per pixel, from what the rasterizer blended to display values ---
   m.def(
       "shade(Tensor image, Tensor alpha, Tensor depth, Tensor normal, Tensor? gloss, "

@@ -67,6 +67,7 @@ __getattr__, __dir__, __all__ = lazy(
         ),
         "gsfluent.ops.graph": ("components", "link_costs", "nearest_seeds"),
         "gsfluent.ops.shade": ("shade",),
+        "gsfluent.ops.texture": ("patch_votes", "quantile_shift", "rows_between"),
         "gsfluent.ops.losses": ("Photometric", "photometric_loss", "photometric_slopes", "ssim"),
         "gsfluent.ops.adam": ("adam_step",),
         "gsfluent.ops.activation": (

@@ -22,6 +22,8 @@ FINE = 8
 """Pixels drawn along each of the finest: the rasterizer's low-pass makes silhouettes thicker by
 half a pixel, and at 2 those of a ball were 30 % too large."""
 STRETCH = (0.3, 3.0)
+EDGES = (0.05, 0.95)
+"""Range of the alpha at which an outline may lie."""
 
 
 class Masks:
@@ -116,6 +118,34 @@ class _Silhouettes:
         self.target = target
         self.splats: Gaussians = setting.splats
         self.followers = Followers("targets.Masks", self.splats.means.double(), setting)
+        self.edge = 0.5
+        self.edge = self._found_edge()
+
+    def _found_edge(self) -> float:
+        """Alpha that makes the silhouettes of frame 0, where all lies at rest, as large as seen."""
+        alphas, known, seen = [], [], 0.0
+        for camera, small in zip(self.target.cameras, self.target.small, strict=True):
+            drawn = self._drawn(self.splats, camera, small[0], torch.ones(self.splats.count, 1))
+            finite = torch.isfinite(small[0])
+            alphas.append(drawn.alpha)
+            known.append(finite.repeat_interleave(FINE, 0).repeat_interleave(FINE, 1))
+            seen += float(small[0][finite].sum()) * FINE**2
+        low, high = EDGES
+        for _ in range(20):
+            middle = 0.5 * (low + high)
+            pairs = zip(alphas, known, strict=True)
+            area = sum(float(_sharp(a.reshape(k.shape), middle)[k].sum()) for a, k in pairs)
+            low, high = (middle, high) if area > seen else (low, middle)
+        return 0.5 * (low + high)
+
+    @staticmethod
+    def _drawn(splats: Gaussians, camera: Camera, seen: Tensor, paint: Tensor) -> Any:
+        """A picture of splats, `FINE` pixels for each of those that are compared."""
+        height, width = (FINE * s for s in seen.shape[-2:])
+        K = camera.K.clone()
+        K[0] *= width / camera.width
+        K[1] *= height / camera.height
+        return draw_at(splats, camera.viewmat, K, (width, height), colors=paint, antialiased=True)
 
     def pair(self, motion: Motion) -> None:
         """Nothing: pixels have places."""
@@ -140,14 +170,11 @@ class _Silhouettes:
         target = self.target
         camera, seen = target.cameras[number], target.small[number][frame]
         height, width = (FINE * s for s in seen.shape)
-        K = camera.K.clone()
-        K[0] *= width / camera.width
-        K[1] *= height / camera.height
         colored = last and target.colors is not None
         paint = splats.colors() if colored else torch.ones(splats.count, 1)
-        drawn = draw_at(splats, camera.viewmat, K, (width, height), colors=paint,
-                        antialiased=True)  # fmt: skip
-        alpha = functional.avg_pool2d(drawn.alpha.reshape(1, 1, height, width), FINE)
+        drawn = self._drawn(splats, camera, seen, paint)
+        outline = _sharp(drawn.alpha.reshape(1, 1, height, width), self.edge)
+        alpha = functional.avg_pool2d(outline, FINE)
         rows = _levels(alpha, seen[None, None]) / target.sigma
         if not colored:
             return rows
@@ -156,6 +183,11 @@ class _Silhouettes:
         there = target.colors[number][frame][None]
         more = _levels(functional.avg_pool2d(image, FINE), there) / target.sigma_color
         return torch.cat([rows, more])
+
+
+def _sharp(alpha: Tensor, edge: float) -> Tensor:
+    """Coverage of pixels whose outline lies where alpha is ``edge``: a ramp about it."""
+    return (0.5 + 0.5 * (alpha - edge) / min(edge, 1.0 - edge)).clamp(0.0, 1.0)
 
 
 def _levels(drawn: Tensor, seen: Tensor) -> Tensor:

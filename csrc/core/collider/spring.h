@@ -17,7 +17,11 @@ constexpr double kSpringStep = 0.25;
 // body that chatters is not held by friction.
 constexpr double kSpringDamping = 0.1;
 // Depth [cells] from which on the force does not grow.
-constexpr double kSpringDepth = 0.5;
+constexpr double kSpringDepth = 1.0;
+// Depths [cells] between which a point comes to lose all of its approach in a step: what is faster
+// than its own waves would outrun a spring. Only what lands above a third of their speed gets
+// there, and loses it in its own shock as well.
+constexpr double kSpringBrake = 0.5, kSpringStop = 0.75;
 // Nodes so deep [cells] inside are held as without springs: what came through them is stopped.
 constexpr double kSpringNode = 1.25;
 // Furthest [cells] from the surface at which a point can be pushed, radius included.
@@ -39,6 +43,12 @@ template <typename T>
 GSF_HOST_DEVICE T spring_speed(T depth, T wave, T length, T dx, T dt, T longest, T times) {
   const T rate = min(wave * wave / (dx * length), T(kSpringStep) / (longest * longest));
   return dt * times * rate * min(depth, T(kSpringDepth) * dx);
+}
+
+// Share of its approach that a point at this depth [m] loses in a step at least.
+template <typename T>
+GSF_HOST_DEVICE T spring_stop(T depth, T dx) {
+  return clamp((depth / dx - T(kSpringBrake)) / T(kSpringStop - kSpringBrake), T(0), T(1));
 }
 
 // Time [s] by which a spring's force is ahead of its depth: what it gives back less than it took.

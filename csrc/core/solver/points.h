@@ -77,9 +77,10 @@ GSF_HOST_DEVICE bool push_point(const SolverView<T>& s, int64_t k, const PushedP
   double away = 0.0;
   for (int axis = 0; axis < 3; ++axis)
     away += normal[axis] * (double(p.velocity[axis]) - own[axis]);
+  const double stopped = -away * spring_stop(depth, dx);
   depth = max(0.0, depth - spring_lag(wave, dx) * away);
   const double gained =
-      spring_speed(depth, wave, cbrt(volume), dx, dt, longest, 1.0 + row[kStiffer]);
+      max(spring_speed(depth, wave, cbrt(volume), dx, dt, longest, 1.0 + row[kStiffer]), stopped);
   for (int axis = 0; axis < 3; ++axis) out[axis] += T(mass * gained * normal[axis]);
   out[3] += T(row[kFriction] * mass * gained);
   return true;

@@ -1,11 +1,64 @@
 // Points of the resident solver that points of other bodies push: core/collider/touch.h.
 #pragma once
 
+#include <bit>
+#include <numeric>
+
 #include "core/solver/points.h"
 #include "cpu/solver/contact.h"
 #include "cpu/solver/surface.h"
 
 namespace gsf::cpu {
+
+// Where the cells of a home lie, by the nine bits of a meta word: which of the 27 blocks around it,
+// which cell of that, and which bit of ContactPlan::readers.
+struct CellPlaces {
+  uint8_t block[512], local[512], half[512];
+  bool used[512];  // by a whole word
+  constexpr CellPlaces() : block{}, local{}, half{}, used{} {
+    for (uint32_t word = 0; word < 512; ++word) {
+      int b = 0, n = 0, h = 0;
+      used[word] = true;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int l = static_cast<int>(word >> (3 * axis) & 7u);
+        const int cell = (l < kLastCell ? l : kLastCell) - 1;
+        used[word] = used[word] && l <= kLastCell;
+        b = 3 * b + (cell >> 2) + 1;
+        n = 4 * n + (cell & 3);
+        h = 2 * h + (l >= 2 ? 1 : 0);
+      }
+      block[word] = static_cast<uint8_t>(b);
+      local[word] = static_cast<uint8_t>(n);
+      half[word] = static_cast<uint8_t>(h);
+    }
+  }
+};
+constexpr CellPlaces kPlaceOf;
+
+// The cells of a block that lie beside cells of another, as bits: f(block, cells) for each of the
+// 27 blocks around it that has any.
+template <typename F>
+void each_beside(uint64_t cells, const F& f) {
+  // Along an axis of this stride: a step down, none and a step up.
+  const auto spread = [](uint64_t in, int stride, uint64_t first, uint64_t* out) {
+    const uint64_t last = first << (3 * stride);
+    out[0] = (in & first) << (3 * stride);
+    out[1] = in | (in & ~first) >> stride | (in & ~last) << stride;
+    out[2] = (in & last) >> (3 * stride);
+  };
+  uint64_t x[3], y[3], z[3];
+  spread(cells, 16, 0xffffull, x);
+  for (int i = 0; i < 3; ++i) {
+    if (x[i] == 0) continue;
+    spread(x[i], 4, 0x000f000f000f000full, y);
+    for (int j = 0; j < 3; ++j) {
+      if (y[j] == 0) continue;
+      spread(y[j], 1, 0x1111111111111111ull, z);
+      for (int k = 0; k < 3; ++k)
+        if (z[k] != 0) f((3 * i + j) * 3 + k, z[k]);
+    }
+  }
+}
 
 template <typename T>
 class TouchPlan {
@@ -49,7 +102,8 @@ class TouchPlan {
 
   // A point that could touch another body.
   struct Item {
-    int32_t point, home, next;  // next: of its cell; home: -1 for points of another rank
+    int32_t point, home;        // home: -1 for points of another rank
+    int32_t first_near, nears;  // those of other bodies within reach, in `nears` of its chunk
     bool pushed;
     double x[3], v[3];  // place in cells and velocity in cells per second
     TouchMatter matter;
@@ -72,6 +126,7 @@ class TouchPlan {
     mark();
     collect([&](int32_t slot, int32_t local) { return (near_[slot] >> local & 1) != 0; },
             [&](const Item& item, int32_t slot, int32_t local) { add(item, slot, local); });
+    arrange();
     push();
   }
   // The same in one rank of several: what its points are, with the numbers of its homes among those
@@ -94,6 +149,7 @@ class TouchPlan {
       if (offer.rank != rank) item.home = -1;
       add(item, slot, offer.local);
     }
+    arrange();
     push();
   }
 
@@ -114,79 +170,84 @@ class TouchPlan {
       item.clear();
       for (auto& along : x) along.clear();
     }
-    void add(int32_t i, const double* place) {
-      item.push_back(i);
-      for (int axis = 0; axis < 3; ++axis) x[axis].push_back(place[axis]);
-    }
   };
-  // Cell of a slot with such points.
+  // Cell of a slot with such points, which follow each other.
   struct Cell {
-    int32_t slot, local;
-    bool meets;
+    int32_t slot, local, first, count;
+  };
+  // A point within reach of another, and their distance [cells].
+  struct Near {
+    int32_t item;
+    double r2;
   };
 
   void push() {
+    nears_.resize((cells_.size() + kCellGrain - 1) / kCellGrain);
     const auto each = [&](const auto& f) {
-      parallel_for(static_cast<int64_t>(cells_.size()), kCellGrain,
-                   [&](int64_t begin, int64_t end) {
-                     Others others, deep;
-                     for (int64_t i = begin; i < end; ++i) f(cells_[i], others, deep);
-                   });
+      parallel_for(static_cast<int64_t>(nears_.size()), 1, [&](int64_t begin, int64_t end) {
+        Others others;
+        for (int64_t chunk = begin; chunk < end; ++chunk) {
+          const int64_t last =
+              std::min<int64_t>((chunk + 1) * kCellGrain, static_cast<int64_t>(cells_.size()));
+          for (int64_t i = chunk * kCellGrain; i < last; ++i) f(cells_[i], nears_[chunk], others);
+        }
+      });
     };
-    each([&](Cell& cell, Others& others, Others&) { find(cell, others); });
-    each([&](const Cell& cell, Others& others, Others& deep) { push(cell, others, deep); });
+    for (auto& nears : nears_) nears.clear();
+    each([&](const Cell& cell, std::vector<Near>& nears, Others& others) {
+      find(cell, nears, others);
+    });
+    each([&](const Cell& cell, const std::vector<Near>& nears, Others&) { push(cell, nears); });
     for (const Item& item : items_)
       if (item.pushed && item.home >= 0) homes_[item.home] = 1;
   }
 
-  // Calls f(home, point, its word, slot, cell of it) for the points near blocks that fields share.
+  // The homes near blocks that fields share, as f(home, readers, first and last of its points).
   template <typename F>
   void each_shared(const F& f) const {
     const HomeList<T>& list = s_.homes();
     for (int64_t h = 0; h < s_.clock->homes; ++h) {
-      const uint32_t shared = ContactPlan<T>::readers(contact_.around_home(h));
-      if (shared == 0) continue;
+      const uint32_t readers = ContactPlan<T>::readers(contact_.around_home(h));
+      if (readers == 0) continue;
       const int64_t begin = std::clamp<int64_t>(list.start[h], 0, s_.count);
-      const int64_t end = begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin);
-      for (int64_t p = begin; p < end; ++p) {
-        const uint32_t meta = s_.meta[p];
-        if (!ContactPlan<T>::reads(shared, meta)) continue;
-        int block = 0, local = 0;
-        for (int axis = 0; axis < 3; ++axis) {
-          const int cell = std::min(meta_cell(meta, axis), kLastCell) - 1;
-          block = 3 * block + (cell >> 2) + 1;
-          local = 4 * local + (cell & 3);
-        }
-        const int32_t slot = s_.neighbour[kNeighbours * h + block];
-        if (slot >= 0 && slot < s_.clock->slots) f(h, p, meta, slot, local);
-      }
+      f(h, readers, begin, begin + std::clamp<int64_t>(list.count[h], 0, s_.count - begin));
     }
+  }
+  // Slot of a cell of a home that is one of readers, or -1.
+  int32_t slot(int64_t h, uint32_t readers, uint32_t word) const {
+    if ((readers >> kPlaceOf.half[word] & 1u) == 0) return -1;
+    const int32_t slot = s_.neighbour[kNeighbours * h + kPlaceOf.block[word]];
+    return slot < s_.clock->slots ? slot : -1;
   }
 
   // Which cells of slots lie beside cells with points of another object, as bits of near_.
   void mark() {
     std::fill(near_.begin(), near_.end(), 0);
     filled_.assign(near_.size(), 0);
-    each_shared([&](int64_t, int64_t, uint32_t, int32_t slot, int32_t local) {
-      filled_[slot] |= uint64_t(1) << local;
+    each_shared([&](int64_t h, uint32_t readers, int64_t begin, int64_t end) {
+      uint64_t words[8] = {};
+      for (int64_t p = begin; p < end; ++p) {
+        const uint32_t word = s_.meta[p] & 511u;
+        words[word >> 6] |= uint64_t(1) << (word & 63);
+      }
+      for (uint32_t i = 0; i < 8; ++i)
+        for (uint64_t left = words[i]; left != 0; left &= left - 1) {
+          const uint32_t word = 64 * i + static_cast<uint32_t>(std::countr_zero(left));
+          const int32_t there = slot(h, readers, word);
+          if (there >= 0) filled_[there] |= uint64_t(1) << kPlaceOf.local[word];
+        }
     });
     for (size_t slot = 0; slot < filled_.size(); ++slot) {
       if (filled_[slot] == 0) continue;
       const int32_t own = s_.object[s_.slot_coord[4 * slot + 3]];
       place(site_[slot]);
       const int32_t* around = around_.data() + kNeighbours * int64_t(site_[slot]);
-      for (uint64_t left = filled_[slot]; left != 0; left &= left - 1) {
-        const int local = __builtin_ctzll(left);
-        for (int o = 0; o < kNeighbours; ++o) {
-          const int there = kNear.at[local][o];
-          const int32_t site = around[kNear.block[local][o]];
-          if (site < 0) continue;
-          const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
-          for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
-            if (s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] != own)
-              near_[slots[f]] |= uint64_t(1) << there;
-        }
-      }
+      each_beside(filled_[slot], [&](int block, uint64_t cells) {
+        if (around[block] < 0) return;
+        const int32_t* slots = s_.site_slots + kSiteFields * int64_t(around[block]);
+        for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f)
+          if (s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] != own) near_[slots[f]] |= cells;
+      });
     }
   }
 
@@ -194,22 +255,33 @@ class TouchPlan {
   template <typename W, typename F>
   void collect(const W& wanted, const F& f) const {
     const double dx = double(s_.dx);
-    each_shared([&](int64_t h, int64_t p, uint32_t meta, int32_t slot, int32_t local) {
-      if (!wanted(slot, local)) return;
-      const int32_t* b = s_.homes().coord + 4 * h;
-      const Row& row = rows_[s_.row_of(meta)];
-      Item item{};
-      item.point = static_cast<int32_t>(p);
-      item.home = static_cast<int32_t>(h);
-      for (int axis = 0; axis < 3; ++axis) {
-        const int cell = std::min(meta_cell(meta, axis), kLastCell) - 1;
-        item.x[axis] = 4.0 * b[axis] + cell + 0.5 + double(s_.offset[3 * p + axis]);
-        item.v[axis] = double(s_.velocity[3 * p + axis]) / dx;
+    each_shared([&](int64_t h, uint32_t readers, int64_t begin, int64_t end) {
+      int32_t slots[512];
+      bool any = false;
+      for (uint32_t word = 0; word < 512; ++word) {
+        if (!kPlaceOf.used[word]) continue;
+        slots[word] = slot(h, readers, word);
+        if (slots[word] >= 0 && !wanted(slots[word], kPlaceOf.local[word])) slots[word] = -1;
+        any = any || slots[word] >= 0;
       }
-      item.matter = row.matter;
-      item.lag = row.lag;
-      item.share = touch_share(double(s_.radius[s_.id[p]]) / dx);
-      f(item, slot, local);
+      const int32_t* b = s_.homes().coord + 4 * h;
+      for (int64_t p = begin; any && p < end; ++p) {
+        const uint32_t meta = s_.meta[p], word = meta & 511u;
+        if (!kPlaceOf.used[word] || slots[word] < 0) continue;
+        const Row& row = rows_[s_.row_of(meta)];
+        Item item{};
+        item.point = static_cast<int32_t>(p);
+        item.home = static_cast<int32_t>(h);
+        for (int axis = 0; axis < 3; ++axis) {
+          item.x[axis] =
+              4.0 * b[axis] + meta_cell(meta, axis) - 0.5 + double(s_.offset[3 * p + axis]);
+          item.v[axis] = double(s_.velocity[3 * p + axis]) / dx;
+        }
+        item.matter = row.matter;
+        item.lag = row.lag;
+        item.share = touch_share(double(s_.radius[s_.id[p]]) / dx);
+        f(item, slots[word], kPlaceOf.local[word]);
+      }
     });
   }
   void clear() {
@@ -220,17 +292,36 @@ class TouchPlan {
       homes_[item.home] = 0;
     }
     cells_.clear();
-    items_.clear();
+    found_.clear();
+    cell_of_.clear();
   }
   void add(const Item& item, int32_t slot, int32_t local) {
-    int32_t& first = first_[int64_t(slot) * kBlockNodes + local];
-    if (first < 0) {
-      cells_.push_back({slot, local, false});
+    int32_t& cell = first_[int64_t(slot) * kBlockNodes + local];
+    if (cell < 0) {
+      cell = static_cast<int32_t>(cells_.size());
+      cells_.push_back({slot, local, 0, 0});
       place(site_[slot]);
     }
-    items_.push_back(item);
-    items_.back().next = first;
-    first = static_cast<int32_t>(items_.size()) - 1;
+    ++cells_[cell].count;
+    found_.push_back(item);
+    cell_of_.push_back(cell);
+  }
+  // What was added, cell by cell.
+  void arrange() {
+    int32_t first = 0;
+    for (Cell& cell : cells_) {
+      cell.first = first;
+      first += cell.count;
+      cell.count = 0;
+    }
+    items_.resize(found_.size());
+    for (auto& along : x_) along.resize(found_.size());
+    for (size_t i = 0; i < found_.size(); ++i) {
+      Cell& cell = cells_[cell_of_[i]];
+      const int32_t at = cell.first + cell.count++;
+      items_[at] = found_[i];
+      for (int axis = 0; axis < 3; ++axis) x_[axis][at] = found_[i].x[axis];
+    }
   }
 
   // The sites around one, once.
@@ -258,64 +349,60 @@ class TouchPlan {
       if (site < 0) continue;
       const int32_t* slots = s_.site_slots + kSiteFields * int64_t(site);
       for (int f = 0; f < kSiteFields && slots[f] >= 0; ++f) {
-        int32_t i = first_[int64_t(slots[f]) * kBlockNodes + there];
-        if (i < 0 || s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] == own) continue;
-        for (; i >= 0; i = items_[i].next) others.add(i, items_[i].x);
+        const int32_t c = first_[int64_t(slots[f]) * kBlockNodes + there];
+        if (c < 0 || s_.object[s_.slot_coord[4 * int64_t(slots[f]) + 3]] == own) continue;
+        const int32_t first = cells_[c].first, last = first + cells_[c].count;
+        others.item.resize(others.item.size() + cells_[c].count);
+        std::iota(others.item.end() - cells_[c].count, others.item.end(), first);
+        for (int axis = 0; axis < 3; ++axis)
+          others.x[axis].insert(others.x[axis].end(), x_[axis].begin() + first,
+                                x_[axis].begin() + last);
       }
     }
   }
 
-  // Distances first: few of them are short enough, and a loop without a choice is a fast one.
-  template <typename F>
-  void each_near(const Item& p, Others& others, const F& f) const {
+  // How much of other bodies the points of a cell find. Distances first: few of them are short
+  // enough, and a loop without a choice is a fast one.
+  void find(const Cell& cell, std::vector<Near>& nears, Others& others) {
+    gather(cell, others);
     const size_t count = others.item.size();
     const double *x = others.x[0].data(), *y = others.x[1].data(), *z = others.x[2].data();
     others.r2.resize(count);
     double* r2 = others.r2.data();
-    for (size_t i = 0; i < count; ++i) {
-      const double d[3] = {p.x[0] - x[i], p.x[1] - y[i], p.x[2] - z[i]};
-      r2[i] = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
-    }
-    for (size_t i = 0; i < count; ++i) {
-      if (!(r2[i] < kTouchReach * kTouchReach)) continue;
-      const double d[3] = {p.x[0] - x[i], p.x[1] - y[i], p.x[2] - z[i]};
-      f(items_[others.item[i]], d, r2[i]);
-    }
-  }
-
-  // How much of other bodies the points of a cell find.
-  void find(Cell& cell, Others& others) {
-    gather(cell, others);
-    cell.meets = !others.item.empty();
-    for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
-         i = items_[i].next) {
+    for (int32_t i = cell.first; i < cell.first + cell.count; ++i) {
       Item& p = items_[i];
+      p.first_near = static_cast<int32_t>(nears.size());
+      for (size_t o = 0; o < count; ++o) {
+        const double d[3] = {p.x[0] - x[o], p.x[1] - y[o], p.x[2] - z[o]};
+        r2[o] = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+      }
       TouchFound found{};
-      if (cell.meets)
-        each_near(p, others, [&](const Item& q, const double* d, double r2) {
-          add_found(q.matter, d, r2, p.v, q.v, found);
-        });
+      for (size_t o = 0; o < count; ++o) {
+        if (!(r2[o] < kTouchReach * kTouchReach)) continue;
+        const Item& q = items_[others.item[o]];
+        const double d[3] = {p.x[0] - x[o], p.x[1] - y[o], p.x[2] - z[o]};
+        add_found(q.matter, d, r2[o], p.v, q.v, found);
+        nears.push_back({others.item[o], r2[o]});
+      }
+      p.nears = static_cast<int32_t>(nears.size()) - p.first_near;
       p.pushed = false;
       p.energy = touch_energy(p.matter, p.share, p.lag, found);
     }
   }
 
   // What the points of a cell get. Two that both find too little of each other's body push nothing.
-  void push(const Cell& cell, Others& others, Others& deep) {
-    if (!cell.meets) return;
-    gather(cell, others);
-    deep.clear();
-    for (const int32_t i : others.item)
-      if (items_[i].energy != 0.0) deep.add(i, items_[i].x);
-    for (int32_t i = first_[int64_t(cell.slot) * kBlockNodes + cell.local]; i >= 0;
-         i = items_[i].next) {
+  void push(const Cell& cell, const std::vector<Near>& nears) {
+    for (int32_t i = cell.first; i < cell.first + cell.count; ++i) {
       Item& p = items_[i];
       if (p.home < 0) continue;
       double sum[3] = {};
-      each_near(p, p.energy != 0.0 ? others : deep, [&](const Item& q, const double* d, double r2) {
-        const double f = touch_force(p.energy, p.matter.volume, q.energy, q.matter.volume, r2);
-        for (int axis = 0; axis < 3; ++axis) sum[axis] += f * d[axis];
-      });
+      for (int32_t n = p.first_near; n < p.first_near + p.nears; ++n) {
+        const Item& q = items_[nears[n].item];
+        if (p.energy == 0.0 && q.energy == 0.0) continue;
+        const double f =
+            touch_force(p.energy, p.matter.volume, q.energy, q.matter.volume, nears[n].r2);
+        for (int axis = 0; axis < 3; ++axis) sum[axis] += f * (p.x[axis] - q.x[axis]);
+      }
       touch_given(sum, s_.clock->dt, double(s_.dx), given_.data() + 4 * int64_t(p.point));
       p.pushed = sum[0] != 0.0 || sum[1] != 0.0 || sum[2] != 0.0;
     }
@@ -324,18 +411,21 @@ class TouchPlan {
   const SolverView<T>& s_;
   const ContactPlan<T>& contact_;
   bool on_ = false;
-  std::vector<Row> rows_;         // [rows]
-  std::vector<uint64_t> near_;    // [slots] cells beside points of another object, as bits
-  std::vector<uint64_t> filled_;  // [slots] cells with points
-  std::vector<int32_t> first_;    // [slots, 64] first item of each cell, or -1
-  std::vector<int32_t> site_;     // [slots]
-  std::vector<uint64_t> key_;     // [sites] ascending
-  std::vector<int32_t> around_;   // [sites, 27] sites around one; -2: not looked for yet
-  std::vector<Item> items_;
+  std::vector<Row> rows_;            // [rows]
+  std::vector<uint64_t> near_;       // [slots] cells beside points of another object, as bits
+  std::vector<uint64_t> filled_;     // [slots] cells with points
+  std::vector<int32_t> first_;       // [slots, 64] number of each cell with points, or -1
+  std::vector<int32_t> site_;        // [slots]
+  std::vector<uint64_t> key_;        // [sites] ascending
+  std::vector<int32_t> around_;      // [sites, 27] sites around one; -2: not looked for yet
+  std::vector<Item> found_, items_;  // as they were found, and cell by cell
+  std::vector<int32_t> cell_of_;     // of those found
+  std::vector<double> x_[3];         // places of items
   std::vector<Cell> cells_;
-  std::vector<T> given_;        // [N, 4]
-  std::vector<uint8_t> homes_;  // [homes]
-  std::vector<T> push_;         // [slots, 64, 4]
+  std::vector<std::vector<Near>> nears_;  // of each kCellGrain cells
+  std::vector<T> given_;                  // [N, 4]
+  std::vector<uint8_t> homes_;            // [homes]
+  std::vector<T> push_;                   // [slots, 64, 4]
 };
 
 }  // namespace gsf::cpu

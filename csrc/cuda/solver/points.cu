@@ -42,16 +42,16 @@ __global__ void __launch_bounds__(kThreads)
 // What `spare` holds between two builds, 32 of its 36 bytes per point (float).
 template <typename T>
 struct Room {
-  Quad<T>* given;   // [N] impulse and how much it may rub [N s]
-  double* energy;   // [N] of those that may touch another object
-  int32_t* next;    // [N] of the list of their cell, or -1
-  int32_t* filled;  // [homes] whether points of a home are given anything
+  Quad<T>* given;    // [N] impulse and how much it may rub [N s]
+  double* energy;    // [N] of those that may touch another object
+  int32_t* next;     // [N] of the list of their cell, or -1
+  unsigned* filled;  // [homes] bits of the largest number that a point of a home is given
 
   __device__ explicit Room(const SolverView<T>& s)
       : given(reinterpret_cast<Quad<T>*>(s.spare)),
         energy(reinterpret_cast<double*>(given + s.count)),
         next(reinterpret_cast<int32_t*>(energy + s.count)),
-        filled(next + s.count) {}
+        filled(reinterpret_cast<unsigned*>(next + s.count)) {}
 };
 // The first point of a cell, plus one.
 template <typename T>
@@ -84,14 +84,18 @@ __device__ float keep_given(const Room<T>& room, int64_t p, const T* given) {
   for (int c = 0; c < 4; ++c) most = larger(float(fabs(given[c])), most);
   return most;
 }
-// Ends a home, whole CTAs together: whether its points are given anything, and the largest number.
+// Before a home's points are given anything, and after some of them were, whole warps together: the
+// largest number.
+template <typename T>
+__device__ void clear_home(const Room<T>& room, int64_t home) {
+  if (threadIdx.x == 0) room.filled[home] = 0;
+}
 template <typename T>
 __device__ void note_given(const SolverView<T>& s, int which, int64_t home, float most) {
-  const int any = __syncthreads_or(!(most == 0.0f));
-  if (threadIdx.x == 0) Room<T>(s).filled[home] = any;
-  if (any == 0) return;
   const unsigned bits = __reduce_max_sync(kAllLanes, sortable(most * 1.000001f));
-  if ((threadIdx.x & 31) == 0) raise_to(given_bound(s, which), bits);
+  if (bits == 0 || (threadIdx.x & 31) != 0) return;
+  atomicMax(Room<T>(s).filled + home, bits);
+  raise_to(given_bound(s, which), bits);
 }
 
 template <typename T>
@@ -107,32 +111,39 @@ __global__ void agree_kernel(const __grid_constant__ SolverView<T> s, int which)
     raise_to(given_bound(s, which), static_cast<unsigned>(*given_bound(s.peers[q], which)));
 }
 
-// Adds what the points of a home are given to the nodes of its window.
+// Adds what the points of a home are given to the nodes of its window, which has a unit of its own
+// as in p2g.h.
+template <typename T>
 struct GivenWindow {
-  unsigned long long sums[4][kTile];
+  typename Fixed<T>::Word sums[4][kTile];
   int32_t neighbour[kNeighbours];
 };
 template <typename T>
-__device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, GivenWindow& window) {
+__device__ void scatter_home(const SolverView<T>& s, int which, int64_t home,
+                             GivenWindow<T>& window) {
   const Room<T> room(s);
-  if (room.filled[home] == 0) return;
+  const unsigned filled = room.filled[home];
+  if (filled == 0) return;
   for (int i = threadIdx.x; i < 4 * kTile; i += kThreads) (&window.sums[0][0])[i] = 0;
   load_slots(s, home, window.neighbour);
   __syncthreads();
   const HomeRange<T> range(s, home);
-  const double per_unit = 1.0 / given_unit(s, which);
+  const double step_unit = given_unit(s, which);
+  const double unit = window_unit<T>(double(__uint_as_float(filled)), 0.43, range.count, step_unit);
+  const int shift = ilogb(unit) - ilogb(step_unit);
+  const T per_unit = T(1.0 / unit);
   for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
     const Quad<T> q = room.given[range.first + r];
-    const double given[4] = {double(q.x), double(q.y), double(q.z), double(q.w)};
-    if (given[0] == 0.0 && given[1] == 0.0 && given[2] == 0.0) continue;
+    const T given[4] = {q.x, q.y, q.z, q.w};
+    if (given[0] == T(0) && given[1] == T(0) && given[2] == T(0)) continue;
     T offset[3];
     const int base = window_base(load_place(s, range.first + r, offset));
     const Stencil<T> st = stencil_at(offset);
     for_each_node([&](int i, int j, int k) {
-      const double w = double(st.weight(i, j, k)) * per_unit;
+      const T w = st.weight(i, j, k) * per_unit;
       for (int c = 0; c < 4; ++c)
-        atomicAdd(&window.sums[c][base + i * kStrideX + j * kStrideY + k],
-                  static_cast<unsigned long long>(__double2ll_rn(w * given[c])));
+        Fixed<T>::add(&window.sums[c][base + i * kStrideX + j * kStrideY + k],
+                      Fixed<T>::round(w * given[c]));
     });
   }
   __syncthreads();
@@ -141,7 +152,7 @@ __device__ void scatter_home(const SolverView<T>& s, int which, int64_t home, Gi
     const int at = window_node(index, i, j, k);
     const int64_t node = slot_node(window.neighbour, i, j, k);
     if (node < 0) continue;
-    const auto units = [&](int c) { return static_cast<long long>(window.sums[c][at]); };
+    const auto units = [&](int c) { return to_units(window.sums[c][at], shift); };
     if ((units(0) | units(1) | units(2) | units(3)) == 0) continue;
     give_node<4>(s, node, units,
                  [&](const SolverView<T>& v) { return which == kPush ? v.push : v.press; });
@@ -168,6 +179,8 @@ __global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ 
   const int64_t home = blockIdx.x;
   if (!may_step(clock) || home >= min(clock.homes, s.count)) return;
   __shared__ unsigned long long near;  // as slot_near: bit 63 stands for all the others
+  const Room<T> room(s);
+  clear_home(room, home);
   if (threadIdx.x == 0) near = 0;
   __syncthreads();
   const int32_t* block = s.homes().coord + 4 * home;
@@ -177,11 +190,11 @@ __global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ 
         collider_clearance(s.collider_state + k * kColliderColumns, s.sdf, middle) <= home_reach(s))
       atomicOr(&near, 1ull << min(k, int64_t(63)));
   __syncthreads();
+  if (near == 0) return;
   const HomeRange<T> range(s, home);
-  const Room<T> room(s);
   const double dx = double(s.dx), longest = longest_step(s);
   float most = 0.0f;
-  for (int64_t r = threadIdx.x; near != 0 && r < range.count; r += kThreads) {
+  for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
     const int64_t p = range.first + r;
     T offset[3], given[4] = {T(0), T(0), T(0), T(0)};
     const uint32_t meta = load_place(s, p, offset);
@@ -206,7 +219,7 @@ __global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ 
 template <typename T>
 __global__ void __launch_bounds__(kThreads)
     push_scatter_kernel(const __grid_constant__ SolverView<T> s) {
-  __shared__ GivenWindow window;
+  __shared__ GivenWindow<T> window;
   if (may_step(*s.clock) && int64_t(blockIdx.x) < min(s.clock->homes, s.count))
     scatter_home(s, kPush, blockIdx.x, window);
 }
@@ -241,24 +254,36 @@ __device__ void for_needers(const SolverView<T>& s, int64_t slot, const F& f) {
     f(s.peers[__ffsll(static_cast<long long>(left)) - 1]);
 }
 
-// Calls f(home) for the homes whose windows touch shared blocks, whole CTAs together. bound_kernel
-// has listed them in `entry`.
+// Calls f(home, part) for the 2^shift parts of the homes whose windows touch shared blocks, whole
+// CTAs together. bound_kernel has listed them in `entry`.
 template <typename T, typename F>
-__device__ void for_shared_homes(const SolverView<T>& s, const F& f) {
+__device__ void for_shared_homes(const SolverView<T>& s, int shift, const F& f) {
   const SolverClock& clock = *s.clock;
   if (!may_step(clock)) return;
-  for (int64_t i = blockIdx.x; i < min(clock.shared_homes, s.count); i += gridDim.x) {
-    const int64_t home = s.entry[i];
-    if (home >= 0 && home < min(min(clock.homes, s.count), s.home_capacity)) f(home);
+  for (int64_t i = blockIdx.x; i < min(clock.shared_homes, s.count) << shift; i += gridDim.x) {
+    const int64_t home = s.entry[i >> shift];
+    if (home >= 0 && home < min(min(clock.homes, s.count), s.home_capacity))
+      f(home, static_cast<int>(i & ((1 << shift) - 1)));
     __syncthreads();  // what lies in shared memory is used again
   }
+}
+// Walks through lists wait for memory, so many threads wait at once: a home's points are given to
+// 2^kSplit CTAs, and kTeam threads of a warp share what is near a point. Their sums are whole
+// numbers, so it does not matter who adds what.
+constexpr int kSplit = 2, kTeam = 4;
+__device__ inline long long team_sum(long long units) {
+  const unsigned lane = threadIdx.x & 31u;
+  const unsigned team = ((1u << kTeam) - 1u) << (lane & ~unsigned(kTeam - 1));
+  for (int offset = kTeam / 2; offset > 0; offset /= 2)
+    units += __shfl_xor_sync(team, units, offset);
+  return units;
 }
 
 template <typename T>
 __global__ void __launch_bounds__(kThreads) list_kernel(const __grid_constant__ SolverView<T> s) {
   __shared__ int32_t neighbour[kNeighbours];
   __shared__ bool shared[kNeighbours];
-  for_shared_homes(s, [&](int64_t home) {
+  for_shared_homes(s, 0, [&](int64_t home, int) {
     load_slots(s, home, neighbour);
     __syncthreads();
     load_shared(s, neighbour, shared);
@@ -285,6 +310,7 @@ struct Around {
   // one before its first node
   int32_t others[kNeighbours], other[kNeighbours][kSiteFields];
   bool filled[kWindowNodes];
+  int32_t active[kThreads], count;
 
   // Whole CTAs together; false when no point of another object is near.
   template <typename T>
@@ -320,6 +346,42 @@ struct Around {
     }
     return __syncthreads_or(any) != 0;
   }
+  // Whether points of other objects may be within reach of one.
+  __device__ bool reaches(uint32_t meta) const {
+    if (!may_touch(shared, meta)) return false;
+    bool any = false;
+    for (int o = 0; o < kNeighbours; ++o) any = any || filled[cell(meta, o)];
+    return any;
+  }
+  // Number of neighbour o of the cell of a point.
+  __device__ static int cell(uint32_t meta, int o) {
+    int index = 0;
+    for (int axis = 0; axis < 3; ++axis)
+      index = 8 * index + min(meta_cell(meta, axis), kLastCell) + neighbour_step(o, axis) + 1;
+    return index;
+  }
+  // Calls f(point) for the points of a part of a home that this is true of, kTeam threads for each
+  // of them together, and rest(point) for the others. Whole CTAs together.
+  template <typename T, typename F, typename R>
+  __device__ void for_points(const SolverView<T>& s, int64_t home, int part, const F& f,
+                             const R& rest) {
+    const HomeRange<T> range(s, home);
+    for (int64_t at = part * kThreads; at < range.count; at += kThreads << kSplit) {
+      if (threadIdx.x == 0) count = 0;
+      __syncthreads();
+      const int64_t r = at + threadIdx.x;
+      if (r < range.count) {
+        const int64_t p = range.first + r;
+        if (reaches(load_meta(s, p)))
+          active[atomicAdd(&count, 1)] = static_cast<int32_t>(p);
+        else
+          rest(p);
+      }
+      __syncthreads();
+      for (int i = threadIdx.x / kTeam; i < count; i += kThreads / kTeam) f(int64_t(active[i]));
+      __syncthreads();
+    }
+  }
   // Calls f(node) for the slots of other objects at a cell of the window, from -1 to 6.
   template <typename F>
   __device__ void for_cell(const int* at, const F& f) const {
@@ -329,16 +391,16 @@ struct Around {
   }
 };
 
-// Calls f(view, q, d, r2) for the points of other objects near one, which `view` holds. The order
-// is any.
+// Calls f(view, q, d, r2) for the points of other objects near one, which `view` holds, those that
+// fall to this thread of a team. The order is any.
 template <typename T, typename F>
 __device__ void for_others(const SolverView<T>& s, const Around& around, uint32_t meta,
                            const T* place, const F& f) {
-  for (int o = 0; o < kNeighbours; ++o) {
+  for (int o = threadIdx.x % kTeam; o < kNeighbours; o += kTeam) {
+    if (!around.filled[Around::cell(meta, o)]) continue;
     int at[3];
     for (int axis = 0; axis < 3; ++axis)
       at[axis] = min(meta_cell(meta, axis), kLastCell) + neighbour_step(o, axis);
-    if (!around.filled[((at[0] + 1) * 8 + at[1] + 1) * 8 + at[2] + 1]) continue;
     const auto walk = [&](const SolverView<T>& v, int64_t node) {
       const int32_t* next = Room<T>(v).next;
       int64_t q = int64_t(*cell_head(v, node)) - 1;
@@ -377,18 +439,17 @@ __device__ inline long long units_of(double value, double per_unit) {
 template <typename T>
 __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ SolverView<T> s) {
   __shared__ Around around;
-  for_shared_homes(s, [&](int64_t home) {
+  const Room<T> room(s);
+  for_shared_homes(s, kSplit, [&](int64_t home, int part) {
+    clear_home(room, home);
     if (!around.load(s, home)) return;
-    const HomeRange<T> range(s, home);
     const double dx = double(s.dx);
     const double stiffness_unit = kShareUnit * stiffness_above(s);
     const double rate_unit = kRateUnit / power_above(fmax(longest_step(s), 1e-30));
     const double per_stiffness = 1.0 / stiffness_unit, per_rate = 1.0 / rate_unit;
-    for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
-      const int64_t p = range.first + r;
+    const auto find = [&](int64_t p) {
       T place[3], speed[3];
       const uint32_t meta = load_place(s, p, place);
-      if (!may_touch(around.shared, meta)) continue;
       load_speed(s, p, speed);
       const double velocity[3] = {double(speed[0]) / dx, double(speed[1]) / dx,
                                   double(speed[2]) / dx};
@@ -405,14 +466,19 @@ __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ 
                    stiffness += units_of(found.stiffness, per_stiffness);
                    rate += units_of(found.rate, per_rate);
                  });
+      share = team_sum(share);
+      stiffness = team_sum(stiffness);
+      rate = team_sum(rate);
+      if (threadIdx.x % kTeam != 0) return;
       const TouchFound sum{double(share) * kShareUnit, double(stiffness) * stiffness_unit,
                            double(rate) * rate_unit};
       double energy = 0.0;
       if (share != 0)
         energy = touch_energy(matter_of(s, meta), touch_share(radius_of(s, p) / dx),
                               spring_lag(row_wave(s, s.row_of(meta)), dx), sum);
-      Room<T>(s).energy[p] = energy;
-    }
+      room.energy[p] = energy;
+    };
+    around.for_points(s, home, part, find, [](int64_t) {});
   });
 }
 
@@ -420,46 +486,42 @@ __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ 
 template <typename T>
 __global__ void __launch_bounds__(kThreads) press_kernel(const __grid_constant__ SolverView<T> s) {
   __shared__ Around around;
-  for_shared_homes(s, [&](int64_t home) {
-    const Room<T> room(s);
-    if (!around.load(s, home)) {
-      if (threadIdx.x == 0) room.filled[home] = 0;
-      return;
-    }
-    const HomeRange<T> range(s, home);
+  const Room<T> room(s);
+  for_shared_homes(s, kSplit, [&](int64_t home, int part) {
+    if (!around.load(s, home)) return;
     const double unit = kShareUnit * stiffness_above(s), per_unit = 1.0 / unit;
     float most = 0.0f;
-    for (int64_t r = threadIdx.x; r < range.count; r += kThreads) {
-      const int64_t p = range.first + r;
+    const auto press = [&](int64_t p) {
       T place[3];
       const uint32_t meta = load_place(s, p, place);
       long long units[3] = {0, 0, 0};
-      if (may_touch(around.shared, meta)) {
-        const double energy = room.energy[p], volume = matter_of(s, meta).volume;
-        for_others(s, around, meta, place,
-                   [&](const SolverView<T>& v, int64_t q, const double* d, double r2) {
-                     const double energy_q = Room<T>(v).energy[q];
-                     if (energy == 0.0 && energy_q == 0.0) return;
-                     const double force = touch_force(energy, volume, energy_q,
-                                                      matter_of(s, load_meta(v, q)).volume, r2);
-                     for (int axis = 0; axis < 3; ++axis)
-                       units[axis] += units_of(force * d[axis], per_unit);
-                   });
-      }
+      const double energy = room.energy[p], volume = matter_of(s, meta).volume;
+      for_others(s, around, meta, place,
+                 [&](const SolverView<T>& v, int64_t q, const double* d, double r2) {
+                   const double energy_q = Room<T>(v).energy[q];
+                   if (energy == 0.0 && energy_q == 0.0) return;
+                   const double force = touch_force(energy, volume, energy_q,
+                                                    matter_of(s, load_meta(v, q)).volume, r2);
+                   for (int axis = 0; axis < 3; ++axis)
+                     units[axis] += units_of(force * d[axis], per_unit);
+                 });
       double sum[3];
       T given[4];
-      for (int axis = 0; axis < 3; ++axis) sum[axis] = double(units[axis]) * unit;
+      for (int axis = 0; axis < 3; ++axis) sum[axis] = double(team_sum(units[axis])) * unit;
+      if (threadIdx.x % kTeam != 0) return;
       touch_given(sum, s.clock->dt, double(s.dx), given);
       most = larger(keep_given(room, p, given), most);
-    }
+    };
+    around.for_points(s, home, part, press,
+                      [&](int64_t p) { room.given[p] = {T(0), T(0), T(0), T(0)}; });
     note_given(s, kPress, home, most);
   });
 }
 template <typename T>
 __global__ void __launch_bounds__(kThreads)
     press_scatter_kernel(const __grid_constant__ SolverView<T> s) {
-  __shared__ GivenWindow window;
-  for_shared_homes(s, [&](int64_t home) { scatter_home(s, kPress, home, window); });
+  __shared__ GivenWindow<T> window;
+  for_shared_homes(s, 0, [&](int64_t home, int) { scatter_home(s, kPress, home, window); });
 }
 
 }  // namespace
@@ -475,7 +537,7 @@ void solver_spring_rows(const SolverView<T>& s, cudaStream_t stream) {
 template <typename T>
 void solver_points(const SolverView<T>& s, int part, cudaStream_t stream) {
   const unsigned homes = static_cast<unsigned>(s.home_capacity);
-  const unsigned shared = min(homes, kSharedCtas);
+  const unsigned shared = min(homes, kSharedCtas), parts = min(homes << kSplit, kSharedCtas);
   const bool touch = points_parts(s) > 2;
   if (s.peers != nullptr && part % 2 == 1)
     agree_kernel<T><<<1, 1, 0, stream>>>(s, part == 1 ? kPush : kPress);
@@ -486,9 +548,9 @@ void solver_points(const SolverView<T>& s, int part, cudaStream_t stream) {
     if (touch) list_kernel<T><<<shared, kThreads, 0, stream>>>(s);
   } else if (part == 1) {
     if (s.collider_count > 0) push_scatter_kernel<T><<<homes, kThreads, 0, stream>>>(s);
-    if (touch) find_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+    if (touch) find_kernel<T><<<parts, kThreads, 0, stream>>>(s);
   } else if (part == 2) {
-    press_kernel<T><<<shared, kThreads, 0, stream>>>(s);
+    press_kernel<T><<<parts, kThreads, 0, stream>>>(s);
   } else {
     press_scatter_kernel<T><<<shared, kThreads, 0, stream>>>(s);
   }

@@ -11,7 +11,8 @@ from torch import Tensor
 from gsfluent.ops.reference.collider import signed_distance
 
 STEP = 0.25  # largest (frequency times longest step)^2
-DEPTH = 0.5  # cells from which on the force does not grow
+DEPTH = 1.0  # cells from which on the force does not grow
+BRAKE, STOP = 0.5, 0.75  # cells between which a point comes to lose all of its approach at least
 DAMPING = 0.1  # of a spring, in dx / wave speed
 NODE = 1.25  # cells inside from which on nodes are held
 
@@ -52,10 +53,12 @@ def point_push(
     """
     distance, normal = signed_distance(row, sdf, position)
     deep = radius - distance
-    ahead = deep - DAMPING * dx / wave * (velocity * normal).sum(-1)
-    depth = torch.where(deep > 0, ahead, 0.0).clamp(0.0, DEPTH * dx)
+    away = (velocity * normal).sum(-1)
+    depth = torch.where(deep > 0, deep - DAMPING * dx / wave * away, 0.0).clamp(0.0, DEPTH * dx)
     rate = (wave**2 / (dx * length)).clamp(max=STEP / longest**2)
-    return (mass * dt * (1.0 + row[31]) * rate * depth)[:, None] * normal
+    stopped = -away * ((deep / dx - BRAKE) / (STOP - BRAKE)).clamp(0.0, 1.0)
+    gained = (dt * (1.0 + row[31]) * rate * depth).maximum(stopped)
+    return (mass * gained)[:, None] * normal
 
 
 def node_friction(

@@ -80,7 +80,7 @@ class Mixed(Forward):
         alone.__dict__.update(scene.__dict__)
         alone.bodies = [plain]
         super().__init__(alone, times, dx, device=device)
-        self.solid = not {LAWS[law] for law in laws} & {LAWS["fluid"], LAWS["drucker_prager"]}
+        self.solid = "fluid" not in laws
         self.basis = corners(self.rest, self.rest, nodes)
         self._numbers = torch.tensor([LAWS[law] for law in laws], dtype=torch.int32)
 
@@ -186,7 +186,9 @@ def run_field(task: FieldTask) -> dict[str, Any]:
             f"fit: {len(unknowns)} numbers for {len(task.laws)} laws on {task.nodes}^3 nodes",
             f"take fewer laws or nodes: {MOST_NUMBERS} numbers at most",
         )
-    problem = Problem(grids[0], task.target.observe(grids[0].setting()), unknowns, task.target.step)
+    bound = [task.target.observe(grid.setting()) for grid in grids]
+    problem = Problem(grids[0], bound[0], unknowns, task.target.step,
+                      fine=bound[1] if task.grids == 2 else None)  # fmt: skip
     free = unknowns.start
     for number, temperature in enumerate(TEMPERATURES):
         for grid in grids:

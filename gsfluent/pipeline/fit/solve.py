@@ -112,18 +112,16 @@ class Problem:
         unknowns: What is learnt.
         step: Difference of the free coordinates.
         fixed: Values that hold besides.
+        fine: The target, bound to the points of a finer grid.
     """
 
     def __init__(
-        self,
-        forward: Forward,
-        observer: Observer,
-        unknowns: Unknowns,
-        step: float,
-        fixed: dict[str, Any] | None = None,
-    ) -> None:
+        self, forward: Forward, observer: Observer, unknowns: Unknowns, step: float,
+        fixed: dict[str, Any] | None = None, fine: Observer | None = None,
+    ) -> None:  # fmt: skip
         self.forward, self.observer, self.unknowns = forward, observer, unknowns
-        self.step, self.fixed = step, fixed or {}
+        self.step, self.fixed, self.fine = step, fixed or {}, fine
+        self._missed = np.zeros(0)
         self.change: Motion | None = None
         self.trust = np.ones((len(forward.times), 1 + len(PATTERNS)))
         self.modes: dict[int, Array] = {}
@@ -176,7 +174,7 @@ class Problem:
     def refine(self, finer: Forward, free: Array, frames: int) -> None:
         """See at these coordinates what a finer grid changes, and how far it is to be trusted."""
         values = self.fixed | self.unknowns.values(free)
-        self.change = None
+        self.change, self._missed = None, np.zeros(0)
         coarse = run_at(self, free, frames)[1]
         values.pop(FINER, None)
         fine = _steady(lambda dt: finer.run(values, frames, dt), finer.step(values))[1]
@@ -194,12 +192,17 @@ class Problem:
             deformation=coarse.deformation + self.change.deformation, impulse=fine.impulse,
         )  # fmt: skip
         gap, frame = self._gaps(coarse, frames, pairs)
-        shift = self._gaps(with_it, frames, pairs)[0] - gap
+        there_gap = self._gaps(with_it, frames, pairs)[0]
+        shift = there_gap - gap
         self._tell_patterns(with_it, frames, frame)
         sizes = self._sizes(shift, frame, frames)
         sizes[:, 1:] = np.maximum.accumulate(sizes[:, 1:], axis=0)
         self._moved[:frames] = sizes[:, 1:]
         self.trust[:frames] = (1.0 + (UNSURE * sizes) ** 2) ** -0.5
+        if self.fine is not None and pairs is None:  # clouds have other neighbours there
+            seen = self.fine.residuals(fine, frames, self.fine.pair(fine))[0].double().numpy()
+            if len(seen) == len(there_gap):
+                self._missed = seen - there_gap
 
     def reweigh(self, free: Array, frames: int) -> None:
         """Take what a frame was missed by for its noise, where it has enough to tell.
@@ -288,9 +291,15 @@ class Problem:
         return self.weighed(gap, frame), frame
 
     def _gaps(self, motion: Motion, frames: int, pairs: Any) -> tuple[Array, NDArray[np.int64]]:
-        """Residuals in standard deviations of the target, and their frames."""
+        """Residuals in standard deviations of the target, and their frames.
+
+        What the finer grid's own points show otherwise than the coarser ones moved as they are is
+        added: between a cell's points of a liquid or of sand lie millimetres.
+        """
         gap, frame = self.observer.residuals(motion, frames, pairs)
-        return gap.double().numpy(), frame.numpy()
+        found = gap.double().numpy()
+        same = len(self._missed) == len(found)
+        return found + self._missed if same else found, frame.numpy()
 
 
 def weights(residual: Array) -> Array:

@@ -66,7 +66,8 @@ def run_task(task: Task) -> dict[str, Any]:
     forward = make(task.dx)
     finer = make(task.dx / RATIO) if task.grids == 2 else None
     observer = task.target.observe(forward.setting())
-    problem = Problem(forward, observer, task.unknowns, task.target.step)
+    fine = None if finer is None else task.target.observe(finer.setting())
+    problem = Problem(forward, observer, task.unknowns, task.target.step, fine=fine)
     try:
         found = in_stages(problem, np.asarray(task.start), finer=finer, shares=task.shares,
                          settle=task.judge or task.shares[-1] == 1.0,

@@ -147,19 +147,30 @@ def draw(kind: str, number: int, cells: int, folder: Path) -> dict[str, Any]:
     return {"kind": kind, "scene": number, "frames": len(frames)}
 
 
-def skinned(solid: Solid) -> Solid:
-    """The solid with splats all over its surface, as small as its voxels."""
-    full = solid.occupancy
-    inner = full.clone()
-    for axis in range(3):
-        for way in (1, -1):
-            inner &= full.roll(way, axis)
-    skin = solid.voxel_centers((full & ~inner).nonzero())
+def skinned(solid: Solid, half: np.ndarray) -> Solid:
+    """The solid with flat splats all over the ellipsoid with these half axes, about as far apart as
+    they are wide; a solid's voxels have stairs, which a camera would see."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4)
+    normal = ball.vertices / half
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    places = torch.from_numpy(ball.vertices * half).float()
+    places[:, 2] += float(half[2])
+    wide = 0.5 * math.sqrt(trimesh.Trimesh(ball.vertices * half, ball.faces).area / len(places))
     splats = Gaussians.from_colors(
-        skin, torch.full((len(skin),), 0.4 * solid.voxel), torch.full((len(skin), 3), 0.5),
+        places, torch.tensor([wide, wide, 0.1 * wide]).repeat(len(places), 1),
+        torch.full((len(places), 3), 0.5), quats=upright(torch.from_numpy(normal).float()),
         label=SURFACE,
     )  # fmt: skip
     return dataclasses.replace(solid, gaussians=splats)
+
+
+def upright(normal: torch.Tensor) -> torch.Tensor:
+    """Quaternions that turn the z axis to normals [N, 3]: halfway from it, and a half turn."""
+    middle = normal + torch.tensor([0.0, 0.0, 1.0])
+    middle[middle.norm(dim=1) < 1e-3] = torch.tensor([1.0, 0.0, 0.0])
+    return torch.cat([torch.zeros(len(normal), 1), torch.nn.functional.normalize(middle, dim=1)], 1)
 
 
 def record(
@@ -171,7 +182,7 @@ def record(
     with np.load(folder / f"{kind}_{number}.npz") as film:
         masks, velocity = film["masks"].astype(np.float32) / 255.0, film["velocity"]
         true = dict(zip(film["names"].tolist(), film["values"].tolist(), strict=True))
-        solid = skinned(ellipsoid(film["half"]))
+        solid = skinned(ellipsoid(film["half"]), film["half"])
     used = list(FEW) if views == len(FEW) else list(range(views))
     random = np.random.default_rng([number, len(kind), 5])
     guess = scene_of(here, solid, here.start, velocity + random.uniform(-0.2, 0.2, 3))

@@ -101,3 +101,26 @@ def test_colours_are_those_of_the_masks() -> None:
         Masks(cameras(), masks, colors=colors[:, :3])
     with pytest.raises(InputError, match="sigma_color"):
         Masks(cameras(), masks, colors=colors, sigma_color=0.0)
+
+
+@pytest.mark.parametrize("size", [1.0, 1.3])
+def test_an_outline_lies_where_it_was_seen_in_frame_0(size: float) -> None:
+    """Masks are sharp: of all that alpha covers by more than a half. Splats drawn larger than those
+    that made them cover as much, and so in frames that the outline was not found in."""
+    masks, _ = films(ball())
+    sharp = (masks > 0.5).astype(np.float32)
+    made = ball()
+    solid = made.bodies[0].solid
+    assert solid is not None
+    larger = solid.gaussians.replace(scales=size * solid.gaussians.scales)
+    made.bodies[0] = dataclasses.replace(
+        made.bodies[0], solid=dataclasses.replace(solid, gaussians=larger)
+    )
+    forward = Forward(made, TIMES, DX)
+    motion = forward.run({KEY: (0.0, 0.0, SPIN)}, FRAMES, forward.step({}))
+    observer = Masks(cameras(), sharp, times=TIMES).observe(forward.setting())
+    gap, frame = observer.residuals(motion, FRAMES, None)
+    area = np.array([float(gap[frame == k].sum()) for k in range(1, FRAMES)]) * 0.02
+    seen = np.array([masks.shape[0] * sharp[:, k].mean() * (32**2 + 16**2) for k in (1, 2, 3)])
+    assert np.abs(area / seen).max() < 0.01
+    assert (observer.edge > 0.6) == (size > 1.0)

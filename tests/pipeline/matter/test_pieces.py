@@ -69,6 +69,30 @@ def test_a_small_body_that_breaks_keeps_its_larger_part() -> None:
     assert pieces.fragments.labels.tolist() == [7] * 20
 
 
+@pytest.mark.parametrize(
+    "normal", [(1.0, 0, 0), (1.0, 1, 0), (1.0, 1, 1), (0.92, 0.38, 0), (0.3, 0.5, 0.8)]
+)
+def test_a_border_knows_no_axes(normal: tuple[float, float, float]) -> None:
+    """Through a flat band of four spacings, at any angle to the lattice of points."""
+    axis = torch.arange(-9.5, 10.0, dtype=torch.float64)
+    rest = torch.cartesian_prod(axis, axis, axis)
+    rest = rest[rest.norm(dim=1) < 10.0].float()
+    n = torch.nn.functional.normalize(torch.tensor(normal, dtype=torch.float64), dim=0)
+    away = rest.double() @ n + 0.2
+    web = web_of(rest, rest_links(rest, ((0, len(rest)),), (1.0,)))
+    position = rest.double() + away.clamp(-0.5, 0.5)[:, None] * n
+    pieces = find_pieces(
+        web, position, away.abs() < 2.0, torch.zeros(len(web.links), dtype=torch.bool), least=64
+    )
+    assert pieces.fragments.count == 2
+    beside = pieces.unit[web.links]
+    middle = rest.double()[web.links[beside[:, 0] != beside[:, 1]]].mean(dim=1)
+    spread = middle - middle.mean(dim=0)
+    found = torch.linalg.eigh(spread.T @ spread)[1][:, 0]
+    assert math.degrees(math.acos(min(1.0, float((found @ n).abs())))) < 1.0
+    assert abs(float((middle @ n).mean()) + 0.2) < 0.5
+
+
 def test_a_broken_point_belongs_to_the_piece_it_lies_closer_to() -> None:
     """A crack that has not opened parts two seeds; the border lies where the band opened most."""
     web = rope(12)

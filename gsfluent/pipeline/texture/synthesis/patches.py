@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent import ops
 from gsfluent.colors import lab100_to_rgb, rgb_to_lab100
 from gsfluent.pipeline.texture.synthesis.bank import Bank, LevelPhoto
 from gsfluent.pipeline.texture.synthesis.levels import hashed, nearest_inside
@@ -227,7 +228,7 @@ def _axis_votes(
         return bank.describe(volume[flat[which][:, None] + offset], guide[which])
 
     salt = int(rng.integers(1 << 31))
-    total = torch.zeros_like(volume)
+    total = volume.new_zeros(volume.shape)
     share = volume.new_zeros(len(volume))
     if len(picked) == 0:
         return total, share
@@ -242,13 +243,7 @@ def _axis_votes(
     for part in picked.split(_CHUNK):
         best, distance = bank.nearest(describe(part))
         weight = 1.0 / (distance + floor)
-        center = flat[part]
-        for k in range(len(offset)):
-            # within one offset no voxel is met twice: the sums are the same in every run
-            at = center + offset[k]
-            votes = weight * falloff[k]
-            total.index_add_(0, at, bank.patches[best, k] * votes[:, None])
-            share.index_add_(0, at, votes)
+        ops.patch_votes(flat[part], offset, best, bank.patches, weight, falloff, total, share)
     return total, share
 
 

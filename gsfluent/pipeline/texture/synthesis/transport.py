@@ -7,6 +7,7 @@ guide's space, new in every round, so that no border between two parts can be se
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsfluent import ops
 from gsfluent.geometry import ascending
 
 _KNOTS = 65
@@ -137,31 +139,17 @@ def _quantiles(values: Tensor, sizes: list[int], picks: Sequence[np.ndarray | No
         beyond = torch.from_numpy(np.arange(most) > last).to(device)
         some = some.masked_fill(beyond[..., None], math.inf)
     ordered = ascending(some.movedim(1, 0)).movedim(0, 1)
-    knots = torch.stack([torch.linspace(0, n - 1, _KNOTS) for n in sizes])
-    low = knots.floor().long().minimum(torch.from_numpy(last))
-    high = (low + 1).minimum(torch.from_numpy(last))
-    share = (knots - low)[..., None].to(device)
-    low, high = (
-        at[..., None].expand(-1, -1, columns) for at in torch.stack([low, high]).to(device)
-    )
-    return ordered.gather(1, low) * (1 - share) + ordered.gather(1, high) * share
+    low, high, share = (np.stack(parts) for parts in zip(*(_knots(n) for n in sizes), strict=True))
+    rows = torch.from_numpy(np.stack([low, high])).to(device)
+    return ops.rows_between(ordered, rows[0], rows[1], torch.from_numpy(share).to(device))
 
 
-def _shift(values: Tensor, have: Tensor, want: Tensor) -> Tensor:
-    """How far the values [P, L, D] of each part move as quantiles ``have`` become ``want``.
-
-    Both are [P, K, D].
-    """
-    knots = have.mT.contiguous()
-    # equal quantiles (flat colour) would make the inverse ambiguous
-    knots = knots + 1e-5 * torch.arange(_KNOTS, device=knots.device)
-    moves = (want - have).mT.contiguous()
-    at = values.mT.contiguous()
-    right = torch.searchsorted(knots, at).clamp_(1, _KNOTS - 1)
-    left_knot, right_knot = knots.gather(2, right - 1), knots.gather(2, right)
-    share = ((at - left_knot) / (right_knot - left_knot)).clamp_(0.0, 1.0)
-    left, last = moves.gather(2, right - 1), moves.gather(2, right)
-    return (left + share * (last - left)).mT
+@functools.lru_cache(maxsize=1024)
+def _knots(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows before and after each quantile of so many values, and the share of the second one."""
+    knots = torch.linspace(0, size - 1, _KNOTS)
+    low = knots.floor().long()
+    return low.numpy(), (low + 1).clamp(max=size - 1).numpy(), (knots - low).numpy()
 
 
 def match_near(
@@ -202,7 +190,7 @@ def match_near(
                 turned = part @ bases
                 have = _quantiles(turned, parts.own.sizes[some], own_picks)
                 want = _quantiles(source @ bases, parts.other.sizes[some], other_picks)
-                part = part + _shift(turned, have, want) @ bases.mT
+                part = part + ops.quantile_shift(turned, have, want) @ bases.mT
             moved[rows[there]] = part[there]
         total += moved
     return total / repeats
@@ -271,7 +259,7 @@ def polish_patches(
                 part = flat[rows]
                 have = _quantiles(part, parts.own.sizes[some], own_picks)
                 want = _quantiles(reference[sources], parts.other.sizes[some], other_picks)
-                moves[rows[there]] = _shift(part, have, want)[there]
+                moves[rows[there]] = ops.quantile_shift(part, have, want)[there]
             spread = torch.zeros(filters, mask.numel(), device=volume.device)
             spread[:, position] = moves.T
             spread = spread.reshape(filters, *mask.shape).permute(1, 0, 2, 3)
