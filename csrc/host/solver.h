@@ -201,7 +201,7 @@ struct SolverOps {
         {"damage_slots", kDamagePlanes, c, i32, true},
         {"damage_homes", h, 1, i32, true},
         {"damage_counts", 4, 1, i32, true},
-        {"damage_scale", kDamageSums + 2, 1, ScalarType::Double, true},
+        {"damage_scale", kDamageScales, 1, ScalarType::Double, true},
     };
     for (int i = 0; i < kSolverBuffers; ++i) {
       check_rows(wanted[i].name, b[i], wanted[i].rows, wanted[i].columns);

@@ -191,11 +191,14 @@ class SolverState:
         """Units of the sums of the damage field, by the largest volume, history and stiffness.
 
         Returns:
-            Four units, 1 of AT2, volume of an empty node (``csrc/core/solver/damage.h``), float64.
+            Four units, 1 of AT2, volume of an empty node, stiffness over volume where all matter has
+            one length or else 0 (``csrc/core/solver/damage.h``), float64 [7].
         """
         own = rows[law == LAWS["phase_field"]].double()
         most = float(own[:, 11].max())
-        stiff = float((own[:, 11] * 2.0 * (own[:, 4] / self.dx) ** 2).max())
+        each = 2.0 * (own[:, 4] * float(rows.new_tensor(1.0 / self.dx))) ** 2
+        stiff = float((own[:, 11] * each).max())
+        even = float(each[0]) if bool((each == each[0]).all()) else 0.0
         # in float the window of a home holds two words of each (csrc/cuda/solver/damage.cu)
         bits = min(sum_bits(self.count), 52 if self.dtype == torch.float64 else 41)
         units = [
@@ -203,7 +206,7 @@ class SolverState:
             for bound in (most, most * DRIVE_MAX, stiff, most)
         ]
         at2 = float(int(own[0, 5]) >= MODELS["at2"])
-        return own.new_tensor([*units, at2, EMPTY * most])
+        return own.new_tensor([*units, at2, EMPTY * most, even])
 
     def _load(self, given: points.Given) -> None:
         """Group the points by block and field and store them, on each rank a stretch of them."""

@@ -24,7 +24,8 @@ enum DamagePlane : int { kHotPlane, kActivePlane, kHotList, kActiveList, kFaces 
 inline constexpr int kDamagePlanes = kFaces + 6;
 enum DamageCount : int { kHotCount, kActiveCount, kHomeCount, kNextHome };
 // Of SolverView::damage_scale, after the units of the sums.
-inline constexpr int kScaleAt2 = kDamageSums, kScaleEmpty = kDamageSums + 1;
+inline constexpr int kScaleAt2 = kDamageSums, kScaleEmpty = kDamageSums + 1,
+                     kScaleStiff = kDamageSums + 2, kDamageScales = kDamageSums + 3;
 enum DamageFace : int32_t { kNoBlock = -1, kUndamaged = -2 };
 
 // What a point gives before its weights, of numbers or of packs of them: its volume, in the unit of

@@ -258,7 +258,8 @@ struct SolverView {
   int32_t* damage_homes;   // [H] homes that meet slots that take part
   int32_t* damage_counts;  // [4] slots of points to solve for, slots that take part, such homes,
                            // homes that are taken
-  double* damage_scale;    // [6] units of the sums, 1 of AT2, volume of an empty node
+  double* damage_scale;    // [7] units of the sums, 1 of AT2, volume of an empty node,
+                           // stiffness over volume of matter of one length, or 0
 
   // Whether this rank answers for a slot: counts its contacts, books its impulses. The first does
   // that needs its velocities.

@@ -150,6 +150,13 @@ struct Solve {
   __device__ DamageNode* nodes(int64_t slot) const {
     return reinterpret_cast<DamageNode*>(s.damage_nodes) + slot * kBlockNodes;
   }
+  // Stiffness of a node: where all matter has one length it goes with the volume, and points do not
+  // give it.
+  __device__ double stiff_of(const int64_t* units) const {
+    const double even = s.damage_scale[kScaleStiff];
+    return even != 0.0 ? double(units[kVolumeSum]) * s.damage_scale[kVolumeSum] * even
+                       : double(units[kStiffSum]) * s.damage_scale[kStiffSum];
+  }
   // Slot beyond face f of a slot, where `inside` is not this one; below 0: what stands there.
   __device__ int32_t beyond(int32_t slot, int f, bool inside) const {
     return inside ? slot : plane(kFaces + f)[slot];
@@ -248,6 +255,7 @@ struct Solve {
     damage_given(double(r[kStressColumn]), double(r[4]) * double(s.inv_dx), double(s.alpha[p]),
                  double(s.peak[p]), given);
     for (int c = 0; c < kDamageSums; ++c) given[c] *= per_unit[c];
+    if (s.damage_scale[kScaleStiff] != 0.0) given[kStiffSum] = 0.0;
     const Stencil<T> st = stencil_at(offset);
     const int base = window_base(meta);
     for (int i = 0; i < 3; ++i)
@@ -275,6 +283,7 @@ struct Solve {
       const int64_t* units = s.damage_sums + kDamageSums * (int64_t(slot) * kBlockNodes + local);
       double sums[kDamageSums];
       for (int c = 0; c < kDamageSums; ++c) sums[c] = double(units[c]) * unit[c];
+      sums[kStiffSum] = stiff_of(units);
       nodes(slot)[local] = damage_node(sums, at2, empty, [&](int f) {
         bool inside;
         const int there = face_node(local, f, inside);
@@ -282,7 +291,7 @@ struct Solve {
         if (other < 0) return other == kUndamaged ? sums[kStiffSum] : 0.0;
         const int64_t* far = s.damage_sums + kDamageSums * (int64_t(other) * kBlockNodes + there);
         if (!(double(far[kVolumeSum]) * unit[kVolumeSum] > empty)) return 0.0;
-        return edge_weight(sums[kStiffSum], double(far[kStiffSum]) * unit[kStiffSum]);
+        return edge_weight(sums[kStiffSum], stiff_of(far));
       });
     }
   }
@@ -315,7 +324,7 @@ struct Solve {
   __device__ void solve_held(const cooperative_groups::grid_group& all) const {
     const bool at2 = s.damage_scale[kScaleAt2] != 0.0;
     const double empty = s.damage_scale[kScaleEmpty];
-    const double volume_unit = s.damage_scale[kVolumeSum], stiff_unit = s.damage_scale[kStiffSum];
+    const double volume_unit = s.damage_scale[kVolumeSum];
     const bool mine = thread < int64_t(s.damage_counts[kActiveCount]) * kBlockNodes;
     const int local = static_cast<int>(thread % kBlockNodes);
     double weight[6] = {}, right = 0.0, inverse = 0.0, value = 0.0;
@@ -326,6 +335,7 @@ struct Solve {
       const int64_t* units = s.damage_sums + kDamageSums * (int64_t(slot) * kBlockNodes + local);
       double sums[kDamageSums];
       for (int c = 0; c < kDamageSums; ++c) sums[c] = double(units[c]) * s.damage_scale[c];
+      sums[kStiffSum] = stiff_of(units);
       own = &nodes(slot)[local].value;
       const DamageNode node = damage_node(sums, at2, empty, [&](int f) {
         bool inside;
@@ -336,7 +346,7 @@ struct Solve {
         const int64_t* far = s.damage_sums + kDamageSums * (int64_t(other) * kBlockNodes + there);
         if (!(double(far[kVolumeSum]) * volume_unit > empty)) return 0.0;
         near[f] = &nodes(other)[there].value;
-        return weight[f] = edge_weight(sums[kStiffSum], double(far[kStiffSum]) * stiff_unit);
+        return weight[f] = edge_weight(sums[kStiffSum], stiff_of(far));
       });
       value = node.value;
       right = node.right;

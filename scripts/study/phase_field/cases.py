@@ -249,10 +249,10 @@ def jobs(quick: bool, device: str) -> list[Job]:
             )  # fmt: skip
     # a beam is borne by its toughness (docs/measured/phase_field.md)
     # grids of which the beam's height and its notch are whole cells
-    for cells in (2.4,) if quick else (2.4, 3.0, 3.75):
+    for fine in (2.4,) if quick else (2.4, 3.0, 3.75):
         add(
-            "bending", f"{cells:g}_toughness", f"{cells:g} dx, toughness", 160.0 * cells**3,
-            lambda c=cells: bending(c, "toughness", wide * 6e-5, device),
+            "bending", f"{fine:g}_toughness", f"{fine:g} dx, toughness", 160.0 * fine**3,
+            lambda c=fine: bending(c, "toughness", wide * 6e-5, device),
         )  # fmt: skip
     for release in (2.6,) if quick else (1.2, 1.6, 2.0, 2.6, 3.2):
         for dx, cost in ((4e-4, 2.0),) if quick else ((1e-4, 130.0), (5e-5, 1100.0)):

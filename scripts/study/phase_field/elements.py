@@ -5,8 +5,9 @@
 The beam of :func:`cases.bending`: 8 x 2 mm in plane strain, notch of 0.4 mm, AT2 without a split,
 l 0.06 mm. Bilinear squares, small strains, forces and damage solved in turn until neither moves,
 history as Miehe's. A crack through elements costs 1 + fine / 2 l of Gc, so they work with that
-much less. By --dx the notch is three cells of the study's grid wide, and what bears the beam touches
-it by edges four cells apart. Leaves bending_elements*.json in OUT, which run.py --enter reads.
+much less. By --dx the notch is three cells of the study's grid wide, and what bears the beam
+touches it by edges four cells apart. Leaves bending_elements*.json in OUT, which run.py --enter
+reads.
 """
 
 from __future__ import annotations
