@@ -18,9 +18,18 @@ from gsfluent.geometry import look_at
 from gsfluent.materials import Material
 from gsfluent.pipeline import Fit
 from gsfluent.pipeline.fit.forward import Forward
-from gsfluent.pipeline.fit.parameters import Parameter, Unknowns, read_learn
-from gsfluent.pipeline.fit.solve import Problem, _covariance, in_stages, lasting, linearise, search
+from gsfluent.pipeline.fit.parameters import FINER, Parameter, Unknowns, read_learn
+from gsfluent.pipeline.fit.solve import (
+    Problem,
+    _covariance,
+    in_stages,
+    lasting,
+    linearise,
+    run_at,
+    search,
+)
 from gsfluent.pipeline.fit.stage import LEFT, conclude, least_informed
+from gsfluent.pipeline.fit.task import unknowns_of
 from gsfluent.pipeline.matter import build_matter
 from gsfluent.targets import Clouds, Force, Masks, Points
 from gsfluent.targets.target import Followers
@@ -228,6 +237,27 @@ def test_a_finer_grid_sets_right_what_a_coarse_one_does_wrong() -> None:
     assert 1.0 < two.values["grid.extrapolation"] < 2.0
     moved = two.report["parameters"][NAMES[0]]["grid"][0]
     assert two.sd[NAMES[0]] >= 0.5 * LEFT * abs(moved) > 0.0
+
+
+def test_with_the_whole_change_the_finer_grid_is_what_is_compared(tracks: Any) -> None:
+    """Its own points, not those of the coarser grid moved as they are."""
+    guess, target = scene(elastic(8e4), velocity=(0.2, 0.0, -2.0)), Points(tracks)
+    forward, finer = Forward(guess, target.times, DX), Forward(guess, target.times, DX / 2)
+    unknowns = unknowns_of(guess, NAMES, offset=False)
+    free = unknowns.start.copy()
+    free[unknowns.slices()[FINER]] = 1.0
+    fine = target.observe(finer.setting())
+    bound = target.observe(forward.setting())
+    gaps = []
+    for one in (None, fine):
+        made = Problem(forward, bound, unknowns, target.step, fine=one)
+        made.refine(finer, free, 6)
+        gaps.append(made._gaps(run_at(made, free, 6)[1], 6, None)[0])
+    values = unknowns.values(free)
+    values.pop(FINER)
+    alone = fine.residuals(finer.run(values, 6, finer.step(values)), 6, None)[0].numpy()
+    np.testing.assert_allclose(gaps[1], alone, atol=1e-6)
+    assert np.abs(gaps[0] - alone).max() > 1e-3
 
 
 def test_coordinates_and_values_are_inverse() -> None:
