@@ -87,8 +87,8 @@ def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_
     assert report["held_out"] == 3 and report["images"] == 24
     assert report["gaussians"] == gaussians.count and seen[-1] == 200
     # no splat has a colour that no photograph shows
-    shown = [view.color[view.mask > 0.9] for view in read_views(capture, 80, torch.device("cpu"), crop=True)
-             if view.mask is not None]  # fmt: skip
+    views = read_views(capture, 80, torch.device("cpu"), crop=True)
+    shown = [view.color[view.mask > 0.9] for view in views if view.mask is not None]
     low, high = torch.cat(shown).aminmax(dim=0)
     assert bool(((gaussians.colors() > low - 1e-4) & (gaussians.colors() < high + 1e-4)).all())
     # Interrupted after 100 steps and resumed, it ends where the uninterrupted run ends.
