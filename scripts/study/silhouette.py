@@ -1,6 +1,7 @@
 """Hair on a silhouette: train a real capture, count the Gaussians that stick out of its hull.
 
     python scripts/study/silhouette.py [--capture apple] [--iterations 1000] [--size 320]
+                                       [--sh-degree 2]
 
 Every run is a line of docs/measured/data/silhouette.jsonl and a row of docs/measured/silhouette.md.
 The hull is carved anew from the silhouettes of the result in all photographs, those held out as
@@ -30,8 +31,8 @@ from gsfluent.pipeline.reconstruct.masks import object_views
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "measured" / "silhouette.md"
 LINES = PAGE.parent / "data" / "silhouette.jsonl"
-HEAD = ("capture", "steps", "pixels", "psnr", "psnr_inside", "object_gaussians", "sticking_out",
-        "needles", "slivers")  # fmt: skip
+HEAD = ("capture", "steps", "pixels", "sh_degree", "psnr", "psnr_inside", "object_gaussians",
+        "sticking_out", "needles", "slivers")  # fmt: skip
 DATA = Path(os.environ.get("GSFLUENT_DATA", ROOT.parent / "shared" / "data"))
 FINE = 192  # voxels along the longest side of the hull
 
@@ -42,12 +43,14 @@ def main() -> int:
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--size", type=int, default=320, help="longer side of a photograph [px]")
     parser.add_argument("--gaussians", type=int, default=40_000, help="at most")
+    parser.add_argument("--sh-degree", type=int, default=0, help="of view-dependent colours")
     parser.add_argument("--device", default="cpu")
     given = parser.parse_args()
     capture = load_capture(DATA / "captures" / given.capture)
     stage = Reconstruct(
-        given.iterations, given.gaussians, image_size=given.size, device=given.device
-    )
+        given.iterations, given.gaussians, image_size=given.size, sh_degree=given.sh_degree,
+        device=given.device,
+    )  # fmt: skip
     result = stage(capture)
     views = read_views(capture, given.size, torch.device(given.device), crop=True)
     if result.labels is None:
@@ -58,7 +61,8 @@ def main() -> int:
         views, _ = object_views(views, found, rest)
     figures = {name: result.report[name] for name in ("psnr", "psnr_inside", "object_gaussians")}
     figures |= hair(found, visual_hull(views, FINE))
-    key = {"capture": given.capture, "steps": given.iterations, "pixels": given.size}
+    key = {"capture": given.capture, "steps": given.iterations, "pixels": given.size,
+           "sh_degree": given.sh_degree}  # fmt: skip
     rows = [json.loads(line) for line in LINES.read_text().splitlines()] if LINES.exists() else []
     rows = [row for row in rows if any(row[name] != key[name] for name in key)]
     rows.append(key | figures)

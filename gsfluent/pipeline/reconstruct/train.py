@@ -20,6 +20,7 @@ from torch import Tensor
 from gsfluent import ops
 from gsfluent.data import Gaussians
 from gsfluent.errors import InputError, RunError
+from gsfluent.geometry import rgb_to_sh0
 from gsfluent.io.atomic import write_tensors
 from gsfluent.pipeline.capture.hull import Hull
 from gsfluent.pipeline.capture.views import TrainView, halved
@@ -44,6 +45,9 @@ _SWEPT = CleanLimits(depth=0.01)  # closer than cleaning at the end, since the r
 _RESTRAIN_EVERY = 10  # steps
 _OBJECT_PULL = 0.03  # opacity_pull of an object at least: its start is a hull that is too large
 _DROP_UNTIL = 0.9  # of the run; what was dropped for an error target is made up for afterwards
+_COVERED = 0.99  # coverage of a pixel that shows nothing but the object
+_LOOKED_AT = 1_000_000  # pixels whose colours are sorted, about
+_GLINTS = 0.001  # share of them at each end of a channel that says nothing about matter
 _RECENT = 64  # steps whose losses are remembered
 _LOOK = {"cpu": 10}  # steps between two looks at the losses
 _LOOK_ELSEWHERE = 50  # each look waits for the device
@@ -101,6 +105,7 @@ class Trainer:
         eyes = torch.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
         self.place = place = Place(hull, eyes)
         self.sweeps: set[int] = set()
+        self.gamut = None if hull is None else _gamut(views)
         if hull is not None:
             self.sweeps = {round(share * settings.iterations) for share in _SWEEPS}
         steps, limit = settings.iterations, settings.max_gaussians
@@ -229,6 +234,9 @@ class Trainer:
         model.step(gradients, progress)
         if self.place.hull is not None:
             clamp_aspect(model)
+        if self.gamut is not None:
+            # Beyond it a splat only makes up for what lies before it, and shows where that parts.
+            torch.clamp(model.parameters["sh0"], *self.gamut, out=model.parameters["sh0"])
         self.density.after_step(model, step + 1)
 
     def _pulls(self) -> Pulls:
@@ -286,6 +294,17 @@ class Trainer:
         self.done = int(state["done"])
         self.order = []
         self.history = [(int(a), int(b), c) for a, b, c in state["history"].tolist()]
+
+
+def _gamut(views: list[TrainView]) -> tuple[Tensor, Tensor] | None:
+    """Lowest and highest colour of an object in photographs, as sh0 [3]; None without masks."""
+    shown = [view.color[view.mask >= _COVERED] for view in views if view.mask is not None]
+    pixels = torch.cat(shown) if shown else torch.empty(0, 3)
+    if len(pixels) == 0:
+        return None
+    ends = pixels[:: max(1, len(pixels) // _LOOKED_AT)].float().sort(dim=0).values
+    spared = int(_GLINTS * len(ends))
+    return rgb_to_sh0(ends[spared]), rgb_to_sh0(ends[len(ends) - 1 - spared])
 
 
 def decibels(mean_squared_error: float) -> float:

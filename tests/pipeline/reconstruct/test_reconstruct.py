@@ -86,6 +86,11 @@ def test_small_reconstruction_reaches_its_bar_and_resumes(capture: Capture, tmp_
     assert report["psnr"] > 25.0 and report["ssim"] > 0.85 and report["psnr_inside"] > 22.0
     assert report["held_out"] == 3 and report["images"] == 24
     assert report["gaussians"] == gaussians.count and seen[-1] == 200
+    # no splat has a colour that no photograph shows
+    views = read_views(capture, 80, torch.device("cpu"), crop=True)
+    shown = [view.color[view.mask > 0.9] for view in views if view.mask is not None]
+    low, high = torch.cat(shown).aminmax(dim=0)
+    assert bool(((gaussians.colors() > low - 1e-4) & (gaussians.colors() < high + 1e-4)).all())
     # Interrupted after 100 steps and resumed, it ends where the uninterrupted run ends.
     file = tmp_path / "state.pt"
     stage = Reconstruct(**settings, checkpoint=file, checkpoint_every=100)
