@@ -124,8 +124,8 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes.
-        rebound: Share of a push that each point gets while it parts from what pushes it, [N], 0 to
-            1, with ``radius``: the square of its matter's restitution. Default: all of it.
+        rebound: Share of a push, [N], that a point with a radius gets while it parts: the square of
+            its matter's restitution. Default: 1.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`), for laws 0 and
             1; others have none. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
@@ -290,8 +290,8 @@ class Solver(SolverState):
                 check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
                 b.sdf = sdf.to(self.device).contiguous()
         if radius is not None:
-            kept = torch.ones_like(radius) if rebound is None else rebound
-            b.radius = torch.stack([radius, kept], dim=1).to(self.device)
+            both = radius, torch.ones_like(radius) if rebound is None else rebound
+            b.radius = torch.stack(both, dim=1).to(self.device)
             if self.device.type == "cuda":  # on a CPU the kernels have them
                 b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
         self._whole, self._parts = b, None
@@ -404,16 +404,14 @@ class Solver(SolverState):
         return ranks
 
     @staticmethod
-    def _surface(
-        radius: Tensor | None, rebound: Tensor | None, like: Tensor, dx: float, cfl: float
-    ) -> None:
+    def _surface(radius: Any, rebound: Any, like: Tensor, dx: float, cfl: float) -> None:
         """Refuse contact radii that are too large or no numbers, and shares that are none."""
         if radius is None:
             return
-        if rebound is not None:
-            check_tensor("Solver", "rebound", rebound, shape=(like.shape[0],), like=like)
-            if not bool(((rebound >= 0) & (rebound <= 1)).all()):
-                raise ValueError("Solver: rebound must be a share of 0 to 1")
+        kept = torch.ones_like(radius) if rebound is None else rebound
+        check_tensor("Solver", "rebound", kept, shape=(like.shape[0],), like=like)
+        if not bool(((kept >= 0) & (kept <= 1)).all()):
+            raise ValueError("Solver: rebound must be a share of 0 to 1")
         check_tensor("Solver", "radius", radius, shape=(like.shape[0],), like=like)
         if not bool(torch.isfinite(radius).all()):
             raise ValueError("Solver: radius must be finite")
