@@ -124,8 +124,7 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes.
-        rebound: Share of a push, [N], that a point with a radius gets while it parts: the square of
-            its matter's restitution. Default: 1.
+        rebound: Share of a push, [N], that is left while a point parts from it; default: 1.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`), for laws 0 and
             1; others have none. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
@@ -409,12 +408,10 @@ class Solver(SolverState):
         if radius is None:
             return
         kept = torch.ones_like(radius) if rebound is None else rebound
-        check_tensor("Solver", "rebound", kept, shape=(like.shape[0],), like=like)
-        if not bool(((kept >= 0) & (kept <= 1)).all()):
-            raise ValueError("Solver: rebound must be a share of 0 to 1")
-        check_tensor("Solver", "radius", radius, shape=(like.shape[0],), like=like)
-        if not bool(torch.isfinite(radius).all()):
-            raise ValueError("Solver: radius must be finite")
+        for name, value in (("radius", radius), ("rebound", kept)):
+            check_tensor("Solver", name, value, shape=(like.shape[0],), like=like)
+        if not bool((torch.isfinite(radius) & (kept >= 0) & (kept <= 1)).all()):
+            raise ValueError("Solver: radius must be finite, and rebound a share of 0 to 1")
         if cfl > CFL_MOST:
             raise InputError(
                 f"Solver: cfl must be at most {CFL_MOST:g} where points are pushed, got {cfl:g}",
