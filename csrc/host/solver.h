@@ -181,7 +181,7 @@ struct SolverOps {
         {"impulse", s.collider_count, kImpulseSums, ScalarType::Double, true},
         {"parent", ints[kFields], 1, i32, true},
         {"cut", ints[kFields], 1, i32, true},
-        {"radius", s.total, 1, real, true},
+        {"radius", s.total, 2, real, true},
         {"viscous", n, kViscousColumns, real, true},
         {"object", ints[kFields], 1, i32, true},
         {"own", n, 9, real, true},

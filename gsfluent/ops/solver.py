@@ -124,6 +124,7 @@ class Solver(SolverState):
             (mode ``separate``, no mass, no sweep; docs/theory/colliders.md, "At a point"). Half the
             cube root of the volume makes a body rest where its points end; a negative one lets a
             point in as deep. Default: colliders hold nodes.
+        rebound: Share of a push, [N], that is left while a point parts from it; default: 1.
         viscous: Viscosity of each point, [N, 9] (:func:`gsfluent.ops.viscous_step`), for laws 0 and
             1; others have none. Default: nothing relaxes and all yields at once, at no cost.
         objects: Object of each field, int32 [K], with ``radius``: points of different objects push
@@ -185,6 +186,7 @@ class Solver(SolverState):
         parent: Tensor | None = None,
         cut: Tensor | None = None,
         radius: Tensor | None = None,
+        rebound: Tensor | None = None,
         viscous: Tensor | None = None,
         objects: Tensor | None = None,
         gravity: Sequence[float] = (0.0, 0.0, -9.81),
@@ -229,7 +231,7 @@ class Solver(SolverState):
         check_tensor(op, "law", law, shape=(None,), dtype=torch.int32)
         check_tensor(op, "params", params, shape=(law.shape[0], 8))
         self.dx = check_dx(op, dx)
-        self._surface(radius, like, self.dx, cfl)
+        self._surface(radius, rebound, like, self.dx, cfl)
         self.outside, self.dtype, self.count = velocity.device, velocity.dtype, n
         self.devices = [] if devices is None else check_devices(devices, self.outside)
         self.device = self.devices[0] if self.devices and not velocity.is_cuda else self.outside
@@ -290,7 +292,8 @@ class Solver(SolverState):
                 check_tensor(op, "sdf", sdf, shape=(None,), dtype=torch.float32)
                 b.sdf = sdf.to(self.device).contiguous()
         if radius is not None:
-            b.radius = radius.to(self.device).contiguous()
+            both = radius, torch.ones_like(radius) if rebound is None else rebound
+            b.radius = torch.stack(both, dim=1).to(self.device)
             if self.device.type == "cuda":  # on a CPU the kernels have them
                 b.spring_rows = b.impulse.new_zeros(len(rows) + 2, 2)
         self._whole, self._parts = b, None
@@ -403,13 +406,15 @@ class Solver(SolverState):
         return ranks
 
     @staticmethod
-    def _surface(radius: Tensor | None, like: Tensor, dx: float, cfl: float) -> None:
-        """Refuse contact radii that are too large or no numbers."""
+    def _surface(radius: Any, rebound: Any, like: Tensor, dx: float, cfl: float) -> None:
+        """Refuse contact radii that are too large or no numbers, and shares that are none."""
         if radius is None:
             return
-        check_tensor("Solver", "radius", radius, shape=(like.shape[0],), like=like)
-        if not bool(torch.isfinite(radius).all()):
-            raise ValueError("Solver: radius must be finite")
+        kept = torch.ones_like(radius) if rebound is None else rebound
+        for name, value in (("radius", radius), ("rebound", kept)):
+            check_tensor("Solver", name, value, shape=(like.shape[0],), like=like)
+        if not bool((torch.isfinite(radius) & (kept >= 0) & (kept <= 1)).all()):
+            raise ValueError("Solver: radius must be finite, and rebound a share of 0 to 1")
         if cfl > CFL_MOST:
             raise InputError(
                 f"Solver: cfl must be at most {CFL_MOST:g} where points are pushed, got {cfl:g}",

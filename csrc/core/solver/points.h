@@ -57,6 +57,7 @@ struct PushedPoint {
   Vec3<double> x;
   T velocity[3];
   double radius;  // [m]
+  double kept;  // share of a push that is left while it parts: the spring loses as its matter does
   int64_t row;
 };
 
@@ -79,8 +80,9 @@ GSF_HOST_DEVICE bool push_point(const SolverView<T>& s, int64_t k, const PushedP
     away += normal[axis] * (double(p.velocity[axis]) - own[axis]);
   const double stopped = -away * spring_stop(depth, dx);
   depth = max(0.0, depth - spring_lag(wave, dx) * away);
-  const double gained =
-      max(spring_speed(depth, wave, cbrt(volume), dx, dt, longest, 1.0 + row[kStiffer]), stopped);
+  const double pushed =
+      spring_speed(depth, wave, cbrt(volume), dx, dt, longest, 1.0 + row[kStiffer]);
+  const double gained = max(away > 0.0 ? p.kept * pushed : pushed, stopped);
   for (int axis = 0; axis < 3; ++axis) out[axis] += T(mass * gained * normal[axis]);
   out[3] += T(row[kFriction] * mass * gained);
   return true;
@@ -117,12 +119,13 @@ GSF_HOST_DEVICE void add_found(const TouchMatter& q, const double* d, double r2,
     sum.rate += q.volume * touch_gradient(r2) * d[axis] * (velocity[axis] - velocity_q[axis]);
 }
 // V dE/df of a point that found this [Pa cells]: `touching` is the share at which it touches, `lag`
-// the time of the damping.
-GSF_HOST_DEVICE double touch_energy(const TouchMatter& p, double touching, double lag,
+// the time of the damping, `kept` as of PushedPoint.
+GSF_HOST_DEVICE double touch_energy(const TouchMatter& p, double touching, double lag, double kept,
                                     const TouchFound& sum) {
   const double over = sum.share - touching;
   if (!(over > 0.0)) return 0.0;
-  return p.volume * max(0.0, over + lag * sum.rate) * min(p.stiffness, sum.stiffness / sum.share);
+  return (sum.rate < 0.0 ? kept : 1.0) * p.volume * max(0.0, over + lag * sum.rate) *
+         min(p.stiffness, sum.stiffness / sum.share);
 }
 // Force of a pair over d, from the energies and volumes of both.
 GSF_HOST_DEVICE double touch_force(double energy, double volume, double energy_q, double volume_q,

@@ -222,8 +222,8 @@ struct SolverView {
   // blades: fields of one body move as one, except on opposite sides of a blade; or null: no blade
   const int32_t* parent;  // [fields] body of each field
   const int32_t* cut;     // [fields] its sides (core/collider/blade.h)
-  // [total] contact radius of each point by its row when it was loaded (core/collider/spring.h)
-  // [m], or null: colliders hold nodes
+  // [total, 2] contact radius of each point by its row when it was loaded (core/collider/spring.h)
+  // [m], and the share of its pushes that it gets while it parts; or null: colliders hold nodes
   const T* radius;
   // [N, 9] viscosity of each point (core/material/viscous.h), or null
   T* viscous;

@@ -109,6 +109,7 @@ class TouchPlan {
     TouchMatter matter;
     double share;   // of other bodies at which it touches
     double lag;     // time of the damping [s]
+    double kept;    // share of a push that is left while bodies part
     double energy;  // V dE/df [Pa cells]
   };
   // One on its way to the other ranks.
@@ -279,7 +280,8 @@ class TouchPlan {
         }
         item.matter = row.matter;
         item.lag = row.lag;
-        item.share = touch_share(double(s_.radius[s_.id[p]]) / dx);
+        item.share = touch_share(double(s_.radius[2 * int64_t(s_.id[p])]) / dx);
+        item.kept = double(s_.radius[2 * int64_t(s_.id[p]) + 1]);
         f(item, slots[word], kPlaceOf.local[word]);
       }
     });
@@ -386,7 +388,7 @@ class TouchPlan {
       }
       p.nears = static_cast<int32_t>(nears.size()) - p.first_near;
       p.pushed = false;
-      p.energy = touch_energy(p.matter, p.share, p.lag, found);
+      p.energy = touch_energy(p.matter, p.share, p.lag, p.kept, found);
     }
   }
 

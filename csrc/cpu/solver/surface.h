@@ -61,7 +61,8 @@ class SurfacePlan {
         point.x[axis] =
             (4.0 * b[axis] - 0.5 + meta_cell(meta, axis) + double(s_.offset[3 * p + axis])) * dx;
       load_speed(s_, p, point.velocity);
-      point.radius = double(s_.radius[s_.id[p]]);
+      point.radius = double(s_.radius[2 * int64_t(s_.id[p])]);
+      point.kept = double(s_.radius[2 * int64_t(s_.id[p]) + 1]);
       point.row = s_.row_of(meta);
       for (const int32_t k : springs_) any = push_point(s_, k, point, step_, &out[4 * i]) || any;
     }

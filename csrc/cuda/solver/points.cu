@@ -162,11 +162,13 @@ __device__ void scatter_home(const SolverView<T>& s, int which, int64_t home,
   }
 }
 
-// Radius of a point [m].
+// Radius of a point [m], and the share of a push that is left while it parts.
 template <typename T>
-__device__ double radius_of(const SolverView<T>& s, int64_t p) {
-  const int32_t id = s.id[p];
-  return id >= 0 && id < s.total ? double(s.radius[id]) : 0.0;
+__device__ double surface_of(const SolverView<T>& s, int64_t p, double& kept) {
+  const int64_t id = s.id[p];
+  const bool known = id >= 0 && id < s.total;
+  kept = known ? double(s.radius[2 * id + 1]) : 1.0;
+  return known ? double(s.radius[2 * id]) : 0.0;
 }
 
 // Friction beyond this holds all the same; the unit of the sums is for less.
@@ -202,7 +204,7 @@ __global__ void __launch_bounds__(kThreads) push_kernel(const __grid_constant__ 
     for (int axis = 0; axis < 3; ++axis)
       point.x[axis] = (4.0 * block[axis] - 0.5 + meta_cell(meta, axis) + double(offset[axis])) * dx;
     load_speed(s, p, point.velocity);
-    point.radius = radius_of(s, p);
+    point.radius = surface_of(s, p, point.kept);
     point.row = s.row_of(meta);
     for (unsigned long long left = near; left != 0; left &= left - 1) {
       const int64_t first = __ffsll(static_cast<long long>(left)) - 1;
@@ -472,10 +474,11 @@ __global__ void __launch_bounds__(kThreads) find_kernel(const __grid_constant__ 
       if (threadIdx.x % kTeam != 0) return;
       const TouchFound sum{double(share) * kShareUnit, double(stiffness) * stiffness_unit,
                            double(rate) * rate_unit};
-      double energy = 0.0;
+      double energy = 0.0, kept;
+      const double radius = surface_of(s, p, kept);
       if (share != 0)
-        energy = touch_energy(matter_of(s, meta), touch_share(radius_of(s, p) / dx),
-                              spring_lag(row_wave(s, s.row_of(meta)), dx), sum);
+        energy = touch_energy(matter_of(s, meta), touch_share(radius / dx),
+                              spring_lag(row_wave(s, s.row_of(meta)), dx), kept, sum);
       room.energy[p] = energy;
     };
     around.for_points(s, home, part, find, [](int64_t) {});

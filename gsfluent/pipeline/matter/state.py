@@ -16,11 +16,11 @@ from gsfluent.io.atomic import write_tensors
 from gsfluent.ops.solver_state import UNBROKEN
 from gsfluent.pipeline.matter.points import Matter
 
-VERSION = 9
+VERSION = 8
 _MOVING = ("velocity", "affine", "strain", "alpha", "deformation", "viscous")
 _POINTS = (
     "position", "peak", "loose", "field", "cut", "group", "asleep", "calm", "unit", "ever",
-    "lowest", "alpha_seen", "time_seen", "calm_at",
+    "lowest", "alpha_seen", "time_seen",
 )  # fmt: skip
 _WHOLE = ("impulse", "colliders", "work", "dissipated", "cut_links")
 _SAVED = {"loose": "stray"}
@@ -173,7 +173,8 @@ def save_state(path: str | Path, state: State, matter: Matter, extra: dict[str, 
         "fingerprint": _fingerprint(matter),
         "particles": {name: v if v is None else v.cpu() for name, v in moving.items()},
         "tensors": {
-            _SAVED.get(name, name): getattr(state, name).cpu() for name in _POINTS + _WHOLE
+            _SAVED.get(name, name): getattr(state, name).cpu()
+            for name in (*_POINTS, "calm_at", *_WHOLE)
         },
         # a state without grips is that of versions before
         **({"given": state.given.cpu()} if state.given.numel() else {}),
@@ -220,6 +221,7 @@ def load_state(path: str | Path, matter: Matter) -> tuple[State, dict[str, Any]]
             hint="resume with the settings it was made with, or start without resume",
         )
     tensors = {name: values["tensors"][_SAVED.get(name, name)] for name in _POINTS + _WHOLE}
+    tensors["calm_at"] = values["tensors"].get("calm_at", tensors["position"])  # before: not kept
     rounded = tensors["position"].to(matter.particles.dtype)
     state = State(
         particles=matter.particles.replace(position=rounded, **values["particles"]),

@@ -100,6 +100,20 @@ def contact_radius(matter: Matter, rigid: RigidSet) -> Tensor:
     return torch.minimum(usual, distance.amin(dim=1))
 
 
+def rebound(matter: Matter) -> Tensor:
+    """Share of what pushes points that is left while they part, [N], float64.
+
+    A spring at the surface stands for a layer of the matter behind it and loses as much as that:
+    what it loses by itself and what of it relaxes.
+    """
+    p = matter.particles
+    loss = matter.params[:, 7].double()
+    solid = (matter.law == LAWS["elastic"]) | (matter.law == LAWS["nacc"])
+    loss = torch.where(solid, torch.where(loss >= 1.0, loss - 1.0, loss), 0.0).clamp(0.0, 1.0)
+    kept = (1.0 - loss)[p.material.long()]
+    return kept if p.viscous is None else kept * (1.0 - p.viscous[:, 6].double())
+
+
 def apart(matter: Matter) -> Tensor:
     """Distance at which each point starts from the faces of other bodies [m], float64 [N].
 
@@ -207,6 +221,7 @@ class Resident:
             constants["devices"] = [f"cuda:{i}" for i in range(there)]
         if options.contact == "points":
             constants["radius"] = at_rows(contact_radius(matter, rigid), rows).to(p.velocity)
+            constants["rebound"] = at_rows(rebound(matter), rows).to(p.velocity)
             which = torch.arange(len(matter.ranges)).repeat_interleave(
                 torch.tensor([end - start for start, end in matter.ranges])
             )

@@ -101,7 +101,7 @@ def test_a_ball_comes_to_rest_on_the_floor():
     simulation = Simulate(dx=0.04)(scene, fps=10, seconds=1.5)
     *_, last = simulation
     weight = float(last.particles.mass.sum()) * 9.81
-    assert last.energy["kinetic"] < 1e-3 * weight * 0.1
+    assert last.energy["kinetic"] < weight * 0.1 * 0.04  # it bounces by a tenth of a cell at most
     lowest = float(last.particles.position[:, 2].min())
     assert -0.02 < lowest < 0.04
     assert simulation.report["momentum_error"] < 1e-5
@@ -295,7 +295,7 @@ def test_names_in_a_saved_state_stay(tmp_path):
     assert sorted(values["particles"]) == ["affine", "alpha", "deformation", "strain", "velocity"]
     assert sorted(values["tensors"]) == sorted(
         ["position", "peak", "stray", "field", "cut", "group", "asleep", "calm", "unit"]
-        + ["ever", "lowest", "alpha_seen", "time_seen", "cut_links"]
+        + ["ever", "lowest", "alpha_seen", "time_seen", "calm_at", "cut_links"]
         + ["impulse", "colliders", "work", "dissipated"]
     )
     assert set(values["extra"]) >= {"counters", "watch", "ledger", "per_frame", "repair"}
