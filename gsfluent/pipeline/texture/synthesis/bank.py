@@ -19,7 +19,8 @@ from torch.nn import functional
 from gsfluent.pipeline.texture.synthesis.transport import Cells
 
 _DIMENSIONS = 24  # principal components of a patch that are compared
-_CHUNK_CELLS = 1 << 25  # scores held at once
+_CHUNK_CELLS = {"cpu": 1 << 21}  # scores held at once: where memory is not fetched anew for them
+_CHUNK_CELLS_ELSEWHERE = 1 << 25
 _PARTS = 24  # parts of the guide's space whose shares are balanced
 
 
@@ -127,7 +128,8 @@ class Bank:
     def nearest(self, query: Tensor) -> tuple[Tensor, Tensor]:
         """Best patch [n] under the weights, and its plain squared distance [n]."""
         offset = self.norm - self.dual
-        rows = max(256, _CHUNK_CELLS // len(offset))
+        most = _CHUNK_CELLS.get(offset.device.type, _CHUNK_CELLS_ELSEWHERE)
+        rows = max(256, most // len(offset))
         best = torch.cat(
             [
                 torch.addmm(offset, part, self.descriptor.T, alpha=-2.0).argmin(1)
