@@ -117,9 +117,10 @@ class Bank:
         ).float()
         population = torch.bincount(self.part, minlength=parts).float().clamp(min=1.0)
         target = ((share + 0.5) / (share + 0.5).sum() / population)[self.part]
-        dual = torch.zeros_like(self.norm)
+        dual, room = torch.zeros_like(self.norm), torch.empty_like(cost)
         for _ in range(steps):
-            usage = torch.softmax((dual - cost) / softness, dim=1).mean(0)
+            torch.sub(dual, cost, out=room)
+            usage = torch.softmax(room.div_(softness), dim=1).mean(0)
             dual = dual - softness * torch.log((usage + 1e-9) / target)
         # far outside the cost scale a weight would override likeness altogether
         spread = 3.0 * float(nearest.mean()) + 1e-4
