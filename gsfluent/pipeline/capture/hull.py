@@ -44,6 +44,11 @@ class Hull:
         """Centres of voxels ``index`` [M, 3]."""
         return self.origin + (index + 0.5) * self.voxel
 
+    @functools.cached_property
+    def points(self) -> Tensor:
+        """Centres of all its voxels [M, 3]."""
+        return self.centers(self.occupancy.nonzero())
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Lower and upper corner of the occupied voxels, [3] each."""
         index = self.occupancy.nonzero()
@@ -274,8 +279,7 @@ def _allowed(points: Tensor, view: TrainView, voxel: float) -> Tensor:
 
 def contradiction(hull: Hull, view: TrainView) -> float:
     """Share of the hull that the mask of a view denies; large when that mask misses a part."""
-    points = hull.centers(hull.occupancy.nonzero())
-    return 1.0 - float(_allowed(points, view, hull.voxel).float().mean())
+    return 1.0 - float(_allowed(hull.points, view, hull.voxel).float().mean())
 
 
 def _touches_edge(mask: Tensor) -> bool:

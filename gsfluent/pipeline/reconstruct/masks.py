@@ -223,17 +223,16 @@ def _bare(hull: Hull, view: TrainView) -> float:
 
 def hull_silhouette(hull: Hull, view: TrainView) -> Tensor:
     """Pixels of a view that show the hull, 0 or 1, [H, W]: its voxels drawn as squares."""
-    points = hull.centers(hull.occupancy.nonzero())
-    local = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    local = hull.points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     depth = local[:, 2]
     front = depth > 1e-6
-    pixel = local[front] @ view.K.T
-    pixel = (pixel[:, :2] / depth[front, None]).floor().long()
+    pixel = ((local @ view.K.T)[:, :2] / depth[:, None]).floor().long()
     width, height = view.size
-    on = ((pixel >= 0) & (pixel < pixel.new_tensor([width, height]))).all(1)
-    drawn = torch.zeros(height, width, device=points.device)
-    drawn[pixel[on, 1], pixel[on, 0]] = 1.0
-    if not bool(on.any()):
+    on = ((pixel >= 0) & (pixel < pixel.new_tensor([width, height]))).all(1) & front
+    drawn = torch.zeros(height, width, device=local.device)
+    x, y = pixel[on].unbind(1)
+    drawn[y, x] = 1.0
+    if len(x) == 0:
         return drawn
     grow = int(0.5 * hull.voxel * float(view.K[0, 0]) / float(depth[front].median()) + 0.5)
     if grow:

@@ -19,7 +19,8 @@ from torch.nn import functional
 from gsfluent.pipeline.texture.synthesis.transport import Cells
 
 _DIMENSIONS = 24  # principal components of a patch that are compared
-_CHUNK_CELLS = 1 << 25  # scores held at once
+_CHUNK_CELLS = {"cpu": 1 << 21}  # scores held at once: where memory is not fetched anew for them
+_CHUNK_CELLS_ELSEWHERE = 1 << 25
 _PARTS = 24  # parts of the guide's space whose shares are balanced
 
 
@@ -116,9 +117,10 @@ class Bank:
         ).float()
         population = torch.bincount(self.part, minlength=parts).float().clamp(min=1.0)
         target = ((share + 0.5) / (share + 0.5).sum() / population)[self.part]
-        dual = torch.zeros_like(self.norm)
+        dual, room = torch.zeros_like(self.norm), torch.empty_like(cost)
         for _ in range(steps):
-            usage = torch.softmax((dual - cost) / softness, dim=1).mean(0)
+            torch.sub(dual, cost, out=room)
+            usage = torch.softmax(room.div_(softness), dim=1).mean(0)
             dual = dual - softness * torch.log((usage + 1e-9) / target)
         # far outside the cost scale a weight would override likeness altogether
         spread = 3.0 * float(nearest.mean()) + 1e-4
@@ -127,7 +129,8 @@ class Bank:
     def nearest(self, query: Tensor) -> tuple[Tensor, Tensor]:
         """Best patch [n] under the weights, and its plain squared distance [n]."""
         offset = self.norm - self.dual
-        rows = max(256, _CHUNK_CELLS // len(offset))
+        most = _CHUNK_CELLS.get(offset.device.type, _CHUNK_CELLS_ELSEWHERE)
+        rows = max(256, most // len(offset))
         best = torch.cat(
             [
                 torch.addmm(offset, part, self.descriptor.T, alpha=-2.0).argmin(1)

@@ -139,17 +139,18 @@ def _quantiles(values: Tensor, sizes: list[int], picks: Sequence[np.ndarray | No
         beyond = torch.from_numpy(np.arange(most) > last).to(device)
         some = some.masked_fill(beyond[..., None], math.inf)
     ordered = ascending(some.movedim(1, 0)).movedim(0, 1)
-    low, high, share = (np.stack(parts) for parts in zip(*(_knots(n) for n in sizes), strict=True))
-    rows = torch.from_numpy(np.stack([low, high])).to(device)
-    return ops.rows_between(ordered, rows[0], rows[1], torch.from_numpy(share).to(device))
+    knots = np.stack([_knots(n) for n in sizes])
+    low = np.floor(knots)
+    rows = np.stack([low, np.minimum(low + 1, last)]).astype(np.int64)
+    before, after = torch.from_numpy(rows).to(device)
+    share = torch.from_numpy(knots - low).to(device)
+    return ops.rows_between(ordered, before, after, share)
 
 
 @functools.lru_cache(maxsize=1024)
-def _knots(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows before and after each quantile of so many values, and the share of the second one."""
-    knots = torch.linspace(0, size - 1, _KNOTS)
-    low = knots.floor().long()
-    return low.numpy(), (low + 1).clamp(max=size - 1).numpy(), (knots - low).numpy()
+def _knots(size: int) -> np.ndarray:
+    """Places of the quantiles among so many ordered values, float32 [K]."""
+    return torch.linspace(0, size - 1, _KNOTS).numpy()
 
 
 def match_near(
