@@ -68,6 +68,8 @@ class TouchPlan {
   // Tables of the blocks; again after each build.
   void make() {
     const SolverClock& c = *s_.clock;
+    cells_.clear();  // of slots that may be gone
+    items_.clear();
     on_ = s_.object != nullptr && s_.radius != nullptr && contact_.any();
     if (!on_) return;
     const double step = spring_step(s_);

@@ -184,7 +184,7 @@ def test_what_rests_sleeps() -> None:
     assert on.report["substeps"] < 0.9 * off.report["substeps"]
     weight = float(on.frames[0].particles.mass.sum()) * 9.81
     assert on.report["frozen_motion"] < 0.01 * weight * DX  # no more than lifts it by that
-    assert_same(on, off, place=0.03, energy=0.01, momentum=0.02)
+    assert_same(on, off, place=0.03, energy=0.01, momentum=0.05)
 
 
 def test_what_sleeps_wakes_when_something_comes() -> None:
