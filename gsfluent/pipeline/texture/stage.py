@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -179,11 +180,15 @@ class Texture(Stage):
             InputError: The exemplar, preset or model cannot be used.
         """
         began = time.perf_counter()
-        domain = InteriorDomain.from_solid(solid, self.axis)
-        domain, mended = mend_unseen_skin(domain, solid.report.get("closed_side"))
+        with ThreadPoolExecutor(1) as pool:  # photographs are read beside the look at the solid
+            loading = None
+            if self.exemplar is not None:
+                loading = pool.submit(load_exemplars, self.exemplar, self.photo)
+            domain = InteriorDomain.from_solid(solid, self.axis)
+            domain, mended = mend_unseen_skin(domain, solid.report.get("closed_side"))
         exemplars, shown, structure = None, None, None
-        if self.exemplar is not None:
-            exemplars = load_exemplars(self.exemplar, self.photo)
+        if loading is not None:
+            exemplars = loading.result()
             if self.photo.white == "skin":
                 skin = domain.skin[domain.shell]
                 exemplars = each(exemplars, lambda photo: with_skin(photo, skin))
