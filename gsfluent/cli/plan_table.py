@@ -26,7 +26,7 @@ def plan_text(plan: Mapping[str, Any]) -> str:
         f"grid: {plan['cells']} cells along the largest body, dx = {1000 * plan['dx']:.3g} mm, "
         f"dt = {1e6 * plan['dt']:.3g} us, {plan['substeps']} steps in {plan['frames']} frames",
         f"      {plan['particles']} points, {plan['particles_per_cell']} a cell, about "
-        f"{plan['active_blocks']:.0f} active blocks",
+        f"{plan['active_blocks']:.0f} active blocks; contact at {plan['contact']}",
         f"      waves at {plan['wave_speed']:.3g} m/s, strikes at {plan['impact_speed']:.3g} m/s",
         "",
         f"bounds of dx: {plan['binding']} binds",

@@ -120,8 +120,9 @@ class SolveSettings:
         choice("auto", "points", "nodes"),
         "What floors, colliders and other bodies push: the `points` of the matter where they are "
         "(`cfl` at most 0.5), or `nodes` of the grid, up to 1.5 cells before the matter is there, "
-        "which take away part of every bounce. `auto`: points, but nodes where `cfl` is above 0.5; "
-        "`run.json` says which. Pieces of one body touch at nodes.",
+        "which take away part of every bounce. `auto`: points where all matter is elastic or a "
+        "metal and `cfl` is at most 0.5, else nodes, for which the losses of brittle presets were "
+        "fitted; `plan` and `run.json` say which. Pieces of one body touch at nodes.",
         "nodes",
         default="auto",
     )

@@ -193,7 +193,7 @@ def plan_shot(
         "frames": prospect.frames,
         "cells": chosen,
         "dx": dx,
-        "contact": solver_options(shot).contact,
+        "contact": solver_options(shot).decided(prospect.scene).contact,
         "bounds": [bound.row() for bound in bounds],
         "binding": binding,
         "budget": _budget(prospect, model),

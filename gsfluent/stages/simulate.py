@@ -111,14 +111,13 @@ def moving_settings(shot: Shot) -> list[Any]:
         name: [_moving(settings), repr(_material(settings))]
         for name, settings in shot.objects.items()
     }
-    contact = solver_options(shot).contact
     return [
         objects,
         [typed_dict(event, EVENTS) for event in shot.events],
         [_collider_key(collider) for collider in shot.colliders],
         [shot.floor, shot.floor_mode, shot.floor_friction, list(shot.gravity)],
         # as it was before there was a choice, where nodes are held
-        [shot.solve.standing, *([] if contact == "nodes" else [contact])],
+        [shot.solve.standing, *([shot.solve.contact] if shot.solve.contact != "nodes" else [])],
         *([shot.solve.inertia] if shot.solve.inertia != "grid" else []),
         *([] if shot.heat is None else [dataclasses.asdict(shot.heat)]),
         shot.output.fps,

@@ -185,3 +185,53 @@ def test_bad_objects_are_refused() -> None:
         _solver(objects=torch.arange(2, dtype=torch.int32))
     with pytest.raises(ValueError, match="objects"):
         _solver(radius=torch.full((128,), 0.25), objects=torch.arange(3, dtype=torch.int32))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_bodies_lose_what_rebound_says(ranks: int, device: str) -> None:
+    """Two cubes that start pressed into each other part more slowly."""
+    if device == "cuda" and ranks > 1:
+        pytest.skip("several ranks of one GPU are tested elsewhere")
+    apart = []
+    for share in (1.0, 0.25):
+        cube = box((0.25, 0.25, 0.25), (3.0, 3.0, 3.0), SPACING).double()
+        place = torch.cat([cube, cube + torch.tensor([2.9, 0.0, 0.0], dtype=torch.float64)])
+        count = len(place)
+        one = torch.ones(count, dtype=torch.float64)
+        made = ops.Solver(
+            place.to(device), torch.zeros(count, 3, dtype=torch.float64, device=device),
+            (0.125 * one).to(device), (0.125 * one).to(device), dx=1.0,
+            law=torch.zeros(1, dtype=torch.int32, device=device),
+            params=torch.tensor(
+                [[0.4, 0.6, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]], dtype=torch.float64, device=device
+            ),
+            body=(torch.arange(count) >= len(cube)).int().to(device), gravity=(0.0, 0.0, 0.0),
+            radius=(0.25 * one).to(device), rebound=(share * one).to(device),
+            objects=torch.arange(2, dtype=torch.int32, device=device), ranks=ranks,
+        )  # fmt: skip
+        made.advance(steps=60)
+        speed = made.velocity.cpu()[:, 0]
+        apart.append(float(speed[len(cube) :].mean() - speed[: len(cube)].mean()))
+    assert apart[0] > 0.01
+    assert 0.3 < apart[1] / apart[0] < 0.95
+
+
+def test_pieces_of_one_object_on_several_ranks() -> None:
+    one, two = (_pieces(ranks) for ranks in (1, 2))
+    assert torch.equal(one.position, two.position)
+
+
+def _pieces(ranks: int) -> ops.Solver:
+    cube = box((0.25, 0.25, 0.25), (4.0, 4.0, 4.0), SPACING).double()
+    place = torch.cat([cube, cube + torch.tensor([4.2, 0.0, 0.0], dtype=torch.float64)])
+    one = torch.ones(len(place), dtype=torch.float64)
+    made = ops.Solver(
+        place, torch.zeros_like(place), 0.125 * one, 0.125 * one, dx=1.0,
+        law=torch.zeros(1, dtype=torch.int32), body=(torch.arange(len(place)) >= len(cube)).int(),
+        params=torch.tensor([[0.4, 0.6, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]], dtype=torch.float64),
+        radius=0.25 * one, objects=torch.zeros(2, dtype=torch.int32), ranks=ranks,
+        gravity=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    made.advance(steps=20)
+    return made

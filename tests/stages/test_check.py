@@ -83,10 +83,8 @@ def test_all_devices_leave_the_motion_as_it_is(splats: Path) -> None:
 def test_points_are_pushed_where_they_can_be(splats: Path) -> None:
     pushed, held = (shot(splats, solve={"contact": name}) for name in ("points", "nodes"))
     assert solver_options(pushed).contact == "points" and solver_options(held).contact == "nodes"
-    assert moving_settings(pushed) == moving_settings(shot(splats)) != moving_settings(held)
-    fast = shot(splats, solve={"cfl": 0.8})  # long steps would make energy there
-    assert solver_options(fast).contact == "nodes"
-    for one in (pushed, held, fast):
+    assert moving_settings(pushed) != moving_settings(shot(splats)) != moving_settings(held)
+    for one in (pushed, held):
         check_shot(one)
     with pytest.raises(InputError, match="cfl must be at most"):
         check_shot(shot(splats, solve={"contact": "points", "cfl": 0.8}))

@@ -70,7 +70,7 @@ class TouchPlan {
     const SolverClock& c = *s_.clock;
     cells_.clear();  // of slots that may be gone
     items_.clear();
-    on_ = s_.object != nullptr && s_.radius != nullptr && contact_.any();
+    on_ = several() && s_.radius != nullptr && contact_.any();
     if (!on_) return;
     const double step = spring_step(s_);
     rows_.resize(s_.row_count);
@@ -158,6 +158,14 @@ class TouchPlan {
 
  private:
   static constexpr int64_t kCellGrain = 32;
+
+  // Whether there are points of different objects.
+  bool several() const {
+    bool differ = false;
+    for (int64_t f = 1; s_.object != nullptr && f < s_.fields; ++f)
+      differ = differ || s_.object[f] != s_.object[0];
+    return differ;
+  }
 
   // What the points of a row of materials have in common.
   struct Row {

@@ -11,8 +11,11 @@ from torch import Tensor
 
 from gsfluent.errors import InputError
 from gsfluent.ops.solver import CFL_MOST
+from gsfluent.scene.scene import Scene
 
 CFL = 0.5
+SPRINGY = ("elastic", "corotated", "yeoh", "ogden", "von_mises")
+"""Laws of matter that neither breaks nor flows apart."""
 
 
 class Unhealthy(Exception):
@@ -104,8 +107,7 @@ class SolverOptions:
         surface: Let plain separating colliders and other bodies push the points, so that bodies lie
             on floors and on each other and not up to 1.5 cells above them (docs/theory/colliders.md
             and contact.md, "At a point"). Pieces of one body touch at nodes. The resident solver
-            only; the composed operators hold nodes. None: where ``cfl`` is at most 0.5, which is
-            as far as they make no energy.
+            only; the composed operators hold nodes. None: see :meth:`decided`.
         inertia: Share out the mass of elastic bodies so that thin ones turn and twist as fast as
             they should (:func:`gsfluent.ops.inertial_shares`). Points near surfaces are lighter.
         all_devices: Step scenes of many points on all GPUs of this machine, with the bits of one
@@ -142,9 +144,23 @@ class SolverOptions:
 
     @property
     def contact(self) -> str:
-        """What floors and other bodies push, ``"points"`` or ``"nodes"``."""
-        pushed = self.cfl <= CFL_MOST if self.surface is None else self.surface
-        return "points" if pushed else "nodes"
+        """What floors and other bodies push once decided, ``"points"`` or ``"nodes"``."""
+        return "points" if self.surface else "nodes"
+
+    def decided(self, scene: Scene) -> SolverOptions:
+        """The same with ``surface`` chosen for a scene, where it is None.
+
+        Points are pushed where all matter is elastic or a metal, and ``cfl`` is at most 0.5. How
+        far brittle presets rebound and break was fitted where nodes are held, and liquids and
+        grains gain nothing.
+        """
+        if self.surface is not None:
+            return self
+        springy = all(
+            body.temperature is None and all(one.law in SPRINGY for one in body.materials)
+            for body in scene.bodies
+        )
+        return dataclasses.replace(self, surface=springy and self.cfl <= CFL_MOST)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.cfl <= 1.0:

@@ -64,7 +64,7 @@ class Stepper:
         flights: Sequence[Flight] = (),
     ) -> None:
         self.scene, self.matter = scene, matter
-        self.options = options = SolverOptions() if options is None else options
+        self.options = options = (options or SolverOptions()).decided(scene)
         self._ordered = options.deterministic and matter.particles.device.type == "cuda"
         self.counters = Counters()
         self.dt_scale = 1.0

@@ -227,3 +227,27 @@ def test_bodies_that_overlap_at_the_start_are_not_thrown_apart() -> None:
     for frame in (1, 2):
         assert run.advance_to(frame, None), run.failure
     assert float(run.state.particles.velocity.abs().max()) < 1e-5  # of rounding
+
+
+@pytest.mark.parametrize(
+    ("material", "options", "wanted"),
+    [
+        ("elastic", {}, "points"),
+        ("rubber", {}, "points"),
+        ("steel", {}, "points"),
+        ("elastic", {"cfl": 0.8}, "nodes"),  # longer steps make energy there
+        ("elastic", {"surface": False}, "nodes"),
+        ("glass", {}, "nodes"),  # its rebound was fitted there
+        ("glass", {"surface": True}, "points"),
+        ("water", {}, "nodes"),
+    ],
+)
+def test_points_are_pushed_where_all_matter_is_elastic(
+    material: str, options: dict[str, object], wanted: str
+) -> None:
+    scene = Scene()
+    there = [Frame(torch.eye(3), torch.tensor([x, 0.0, 0.2]), 1.0) for x in (0.0, 1.0)]
+    scene.add(ellipsoid((0.2, 0.2, 0.2)), SOFT, frame=there[0])
+    scene.add(ellipsoid((0.2, 0.2, 0.2)), materials.get(material), frame=there[1])
+    run = Run(scene, build_matter(scene, DX), 20.0, SolverOptions(**options))
+    assert run.report()["contact"] == wanted == SolverOptions(**options).decided(scene).contact
