@@ -191,8 +191,8 @@ class SolverState:
         """Units of the sums of the damage field, by the largest volume, history and stiffness.
 
         Returns:
-            Four units, 1 of AT2, volume of an empty node, stiffness over volume where all matter has
-            one length or else 0 (``csrc/core/solver/damage.h``), float64 [7].
+            Four units, 1 of AT2, volume of an empty node, stiffness over volume where all matter
+            has one length or else 0 (``csrc/core/solver/damage.h``), float64 [7].
         """
         own = rows[law == LAWS["phase_field"]].double()
         most = float(own[:, 11].max())

@@ -19,7 +19,7 @@ namespace {
 // Threads of a CTA, of which each multiprocessor runs one: half of its registers are left to p2g.
 constexpr int kDamageThreads = 512, kDamageShare = 2;
 // Groups of a CTA, each of which takes a home after the other: while one waits for memory or for
-// its last thread, the others add. By one home a CTA at a time the sums of points took 2.2 times as
+// its last thread, the others add. By one home a CTA at a time the sums took two to four times as
 // long as the relaxation (H200).
 constexpr int kGroups = 4, kGroupThreads = kDamageThreads / kGroups;
 
