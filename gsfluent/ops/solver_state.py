@@ -125,11 +125,7 @@ class SolverState:
         """
         if material is not None:
             check_tensor("Solver", "material", material, shape=(self.count,), dtype=torch.int32)
-        unique = self._alike(material, mass, volume)
-        if unique is not None:
-            row = mass.new_zeros(self.count, dtype=torch.int32) if material is None else material
-        else:
-            row, unique = self._unlike(material, mass, volume)
+        row, unique = self._alike(material, mass, volume) or self._unlike(material, mass, volume)
         if unique.shape[0] > layout.MAX_ROWS:
             raise ValueError(
                 f"Solver: {unique.shape[0]} different (material, mass, volume), at most "
@@ -144,11 +140,12 @@ class SolverState:
         rows = torch.cat([self._params[which], numbers.to(self._params)], dim=1)
         return row, rows.contiguous(), self._law[which].contiguous()
 
-    def _alike(self, material: Tensor | None, mass: Tensor, volume: Tensor) -> Tensor | None:
-        """What :meth:`_unlike` finds, of every row of parameters, without a sort.
+    def _alike(
+        self, material: Tensor | None, mass: Tensor, volume: Tensor
+    ) -> tuple[Tensor, Tensor] | None:
+        """What :meth:`_unlike` finds, without a sort.
 
-        None where points of one row differ, or there are very many. Rows without points have no
-        mass and no volume.
+        None where points of one row of parameters differ, or there are very many.
         """
         count = self._law.shape[0]
         if max(self.count, count) > layout.MAX_ROWS:
@@ -161,10 +158,15 @@ class SolverState:
             wrong = row != material
         table = facts.new_zeros(2, count).scatter_(1, row.expand(2, -1), facts)
         differs = (table.gather(1, row.expand(2, -1)) != facts).any(0)
-        if bool((wrong | differs).any()):
+        used = table[0] > 0.0
+        unlike, all_used = torch.stack([(wrong | differs).any(), used.all()]).tolist()
+        if unlike:
             return None
         numbers = torch.arange(count, device=table.device, dtype=torch.float64)
-        return torch.cat([numbers[None], table.double()]).T.to(self.device)
+        unique = torch.cat([numbers[None], table.double()]).T
+        if not all_used:  # a row without points must not be the one with the fastest waves
+            row, unique = (torch.cumsum(used, 0) - 1)[row], unique[used]
+        return row.to(torch.int32), unique.to(self.device)
 
     def _unlike(
         self, material: Tensor | None, mass: Tensor, volume: Tensor
