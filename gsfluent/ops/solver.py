@@ -73,9 +73,8 @@ def _no_restitution(op: str, contact: float, colliders: Tensor | None) -> None:
     bounces = rows is not None and bool((rows[:, RESTITUTION] > 0).any())
     if contact != 0.0 or bounces:
         raise ValueError(
-            f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: given back "
-            "at nodes in every step of a lasting contact it makes energy (docs/theory/contact.md);"
-            " how far bodies bounce follows from their elasticity"
+            f"{op}: restitution of {'a collider' if bounces else 'contact'} must be 0: at nodes it "
+            "makes energy (docs/theory/contact.md); bodies bounce by their elasticity"
         )
 
 
@@ -99,7 +98,7 @@ class Solver(SolverState):
 
     Args:
         position: Positions [m], [N, 3], float32 or float64 (the dtype of the whole state). They are
-            kept relative to their cell, so distance from the origin costs no digits inside.
+            kept relative to their cell: distance from the origin costs no digits inside.
         velocity: Velocities [m/s], [N, 3].
         mass: Masses [kg], [N].
         volume: Volumes at rest [m^3], [N].
@@ -214,13 +213,11 @@ class Solver(SolverState):
             raise ValueError(f"{op}: position must have 1 to {layout.MAX_PARTICLES} rows, got {n}")
         like = velocity
         check_tensor(op, "velocity", velocity, shape=(n, 3))
-        named = {"mass": mass, "volume": volume}
-        for name, value in named.items():
+        for name, value in (("mass", mass), ("volume", volume)):
             check_tensor(op, name, value, shape=(n,), like=like)
-        good = [((value > 0) & torch.isfinite(value)).all() for value in named.values()]
-        for name, fine in zip(named, torch.stack(good).tolist(), strict=True):
-            if not fine:
-                raise ValueError(f"{op}: {name} must be positive and finite")
+        good = [((value > 0) & torch.isfinite(value)).all() for value in (mass, volume)]
+        if not all(both := torch.stack(good).tolist()):  # the device is asked once
+            raise ValueError(f"{op}: {'volume' if both[0] else 'mass'} must be positive and finite")
         optional = (
             ("strain", strain, (n, 6)), ("alpha", alpha, (n,)), ("peak", peak, (n,)),
             ("affine", affine, (n, 3, 3)), ("deformation", deformation, (n, 3, 3)),
