@@ -216,8 +216,8 @@ class Solver(SolverState):
         for name, value in (("mass", mass), ("volume", volume)):
             check_tensor(op, name, value, shape=(n,), like=like)
         good = [((value > 0) & torch.isfinite(value)).all() for value in (mass, volume)]
-        if not all(both := torch.stack(good).tolist()):  # the device is asked once
-            raise ValueError(f"{op}: {'volume' if both[0] else 'mass'} must be positive and finite")
+        if not all(fine := torch.stack(good).tolist()):  # the device is asked once
+            raise ValueError(f"{op}: {'volume' if fine[0] else 'mass'} must be positive and finite")
         optional = (
             ("strain", strain, (n, 6)), ("alpha", alpha, (n,)), ("peak", peak, (n,)),
             ("affine", affine, (n, 3, 3)), ("deformation", deformation, (n, 3, 3)),
