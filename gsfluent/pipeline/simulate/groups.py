@@ -85,11 +85,13 @@ def grid_mask(state: State, matter: Matter) -> Tensor:
     return mask
 
 
-def count_calm(state: State, on_grid: Tensor, gravity: Tensor, dx: float, frame: float) -> State:
+def count_calm(
+    state: State, on_grid: Tensor, gravity: Tensor, dx: float, frame: float, trembles: bool
+) -> State:
     """Count the frames during which points hardly moved.
 
-    What trembles in one place rests, too: a springy body on a floor that pushes its points keeps
-    for seconds what lifts it by less than anyone sees.
+    Where points are pushed what trembles in one place rests, too: a springy body keeps for seconds
+    what lifts it by less than anyone sees.
 
     Args:
         state: State at a frame.
@@ -97,12 +99,15 @@ def count_calm(state: State, on_grid: Tensor, gravity: Tensor, dx: float, frame:
         gravity: Acceleration [m/s^2], float64 [3].
         dx: Grid spacing [m].
         frame: Time since they were last counted [s].
+        trembles: Whether points are pushed.
     """
     p = state.particles
     unit = float(gravity.norm() * dx) ** 0.5
     speed = p.velocity.norm(dim=1) + dx * torch.linalg.matrix_norm(p.affine)
     moved = (state.position - state.calm_at).norm(dim=1) / frame
-    slow = (speed < CALM * unit) | ((moved < CALM * unit) & (speed < TREMBLE * unit))
+    slow = speed < CALM * unit
+    if trembles:
+        slow |= (moved < CALM * unit) & (speed < TREMBLE * unit)
     calm = torch.where(slow, state.calm + 1, torch.zeros_like(state.calm)).clamp(max=1000)
     return state._replace(calm=torch.where(on_grid, calm, state.calm), calm_at=state.position)
 

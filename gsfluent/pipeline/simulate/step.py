@@ -144,7 +144,8 @@ class Stepper:
         state = self._renumber(state, on_grid)
         if not at_frame:
             return state
-        state = count_calm(state, on_grid, self._gravity, self.matter.dx, frame)
+        trembles = self.options.contact == "points"
+        state = count_calm(state, on_grid, self._gravity, self.matter.dx, frame, trembles)
         state = self.leaving(state, state.unit, frame)
         self.counters.naps, self.counters.piece_flights = self.leaving.naps, self.leaving.flights
         return state
