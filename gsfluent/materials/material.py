@@ -55,9 +55,9 @@ SHEAR = 0.03
 and so little that what is pressed hard cracks before it is powder (a plaster ball that falls 0.75 m
 is whole, with 0.5 it is crushed)."""
 _PLAIN = {"variation": 0.0, "weibull_modulus": 0.0, "prefer": "toughness", "hysteresis": "pressed"}
+"""What only brittle matter reads, as it is in other matter."""
 _OPENED = (*DERIVED, "shear_damage")
 """What the strengths and the energy fix on Rankine's surface."""
-"""What only brittle matter reads, as it is in other matter."""
 _PLAIN_FIELD = {"split": "volumetric", "model": "at1"}
 """What only phase_field reads."""
 UNBROKEN = -1.0
@@ -517,9 +517,8 @@ class Material:
         kappa = plain[..., 1]
         tensile, compressive = torch.broadcast_tensors(*self.strengths(at), kappa)[:2]
         if self.surface == "rankine":
-            none = torch.zeros_like(tensile)
-            mu = plain[..., 0]
-            beta, hardening, alpha0, _ = opening(mu, kappa, tensile, none, prefer="strength")
+            mu, no_energy = plain[..., 0], torch.zeros_like(tensile)
+            beta, hardening, alpha0, _ = opening(mu, kappa, tensile, no_energy, prefer="strength")
             found = {"cohesion": beta, "hardening": hardening, "alpha0": alpha0}
             return found | {"shear_damage": -compressive / tensile}
         beta, p0 = ellipse(plain[..., 2], tensile, compressive, LARGEST * kappa)

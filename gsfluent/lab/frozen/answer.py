@@ -16,7 +16,7 @@ from gsfluent.fracturebench.scene import Scene
 from gsfluent.fracturebench.scenes.rows import BAND_CELLS
 from gsfluent.lab.world.driver import World
 from gsfluent.lab.world.drives import Drives, damage
-from gsfluent.lab.world.shapes import parameters
+from gsfluent.lab.world.shapes import moduli, parameters
 from gsfluent.materials import Material, opening, phase_field
 from gsfluent.ops.collider import collider_row
 from gsfluent.ops.plasticity import LAWS
@@ -50,8 +50,7 @@ def _rankine(m: Mapping[str, Any], dx: float) -> tuple[dict[str, float], float]:
     Strength and fracture energy are those that the row states; in compression it holds what its
     ellipse does in one axis.
     """
-    young, nu = float(m["young_modulus"]), float(m["poisson_ratio"])
-    mu, kappa = young / (2.0 * (1.0 + nu)), young / (3.0 * (1.0 - 2.0 * nu))
+    mu, kappa = moduli(float(m["young_modulus"]), float(m["poisson_ratio"]))
     slope, beta = float(m["friction"]), float(m["cohesion"])
     tensile = float(m["tensile_strength"])
     p0 = kappa * math.sinh(-float(m["hardening"]) * float(m["alpha"]))
