@@ -31,6 +31,9 @@ case ${1:-} in
     clang_format --dry-run -Werror
     # two processes of one thread each: most tests are too small for two threads
     export OMP_NUM_THREADS=1
+    # what is imported is compiled once for all processes, and tests for the next time
+    unset PYTHONDONTWRITEBYTECODE
+    export PYTHONPYCACHEPREFIX="$PWD/build/bytecode"
     set -- -n 2 --dist loadfile ;;
 esac
 exec "$PYTHON" -m pytest "$@"

@@ -276,7 +276,7 @@ def test_a_melon_breaks_into_the_same_pieces_on_several_ranks_and_threads(
 
     monkeypatch.setattr(ops.Solver, "counters", counters)
     before = torch.get_num_threads()
-    for ranks, threads in ((1, 1), (3, 1), *([(1, 2)] if device == "cpu" else [])):
+    for ranks, threads in ((1, 1), (3, 2 if device == "cpu" else 1)):
         monkeypatch.setitem(ops.Solver.__init__.__kwdefaults__, "ranks", ranks)
         torch.set_num_threads(threads)
         stage = Simulate(dx=DX, splats=False, device=device)
@@ -285,13 +285,12 @@ def test_a_melon_breaks_into_the_same_pieces_on_several_ranks_and_threads(
         finally:
             torch.set_num_threads(before)
         ends.append(last)
-    one = ends[0]
+    one, other = ends
     assert used == {1, 3} and one.stats["pieces"] > 1 and one.stats["broken_fraction"] > 0.1
-    for other in ends[1:]:
-        for name in ("position", "velocity", "strain", "alpha"):
-            assert torch.equal(getattr(other.particles, name), getattr(one.particles, name)), name
-        assert torch.equal(other.fragments, one.fragments)
-        assert other.stats == one.stats
+    for name in ("position", "velocity", "strain", "alpha"):
+        assert torch.equal(getattr(other.particles, name), getattr(one.particles, name)), name
+    assert torch.equal(other.fragments, one.fragments)
+    assert other.stats == one.stats
 
 
 @pytest.mark.cuda
