@@ -94,12 +94,13 @@ def smaller(words: list[str]) -> list[str]:
 
 
 def one_by_one(
-    function: Any, items: Any, folder: str | Path, *, ids: Any, **options: Any
+    function: Any, items: Any, folder: str | Path, *, ids: Any = None, **options: Any
 ) -> list[Outcome]:
     """A sweep without processes, which would import torch anew."""
     folder = Path(folder)
     place = SweepFolder(folder)
     place.make()
+    ids = ids or [str(number) for number in range(len(items))]
     for item, name in zip(items, ids, strict=True):
         assert attempt(folder.absolute(), name, function, item) == DONE
     rows = [place.row(name) or {} for name in ids]
@@ -126,6 +127,7 @@ def test_command_does_what_it_says(
     monkeypatch.setitem(from_input.SETTINGS, "output", {"size": [64, 48], "fps": 5, "seconds": 0.8})
     monkeypatch.setattr("gsfluent.sweep.shots.map", one_by_one)
     monkeypatch.setattr("gsfluent.dataset.write.map", one_by_one)
+    monkeypatch.setattr("gsfluent.lab.stability.run.sweep_map", one_by_one)
     before = files(place)
     assert main(smaller(words)) == 0
     said = capsys.readouterr().out

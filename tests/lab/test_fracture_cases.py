@@ -373,24 +373,14 @@ def test_drives_push_ramp_and_damp_as_they_say() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "missed"),
-    [
-        ("brazilian_disc", set()),
-        ("notch_tension", set()),
-        ("stretched_bar", set()),
-        ("kalthoff", set()),
-        ("double_cantilever", set()),
-        ("rock_press", {"strength at 180 1/s over that at 50 1/s"}),
-    ],
-)  # fmt: skip
-def test_gsfluent_on_a_small_setting_passes_or_misses_what_the_page_says(
-    name: str, missed: set[str]
-) -> None:
+    "name", ["brazilian_disc", "notch_tension", "stretched_bar", "kalthoff", "double_cantilever"]
+)
+def test_gsfluent_on_a_small_setting_passes_as_the_page_says(name: str) -> None:
     dx = 0.1 / 48 if name == "kalthoff" else SMALL[name]
     scene = find(name).build(dx, 8)
     run = run_case(scene)
     assert not run.failed
-    assert {m.quantity for m in judge(scene, run) if not m.passed} == missed
+    assert [m.quantity for m in judge(scene, run) if not m.passed] == []
 
 
 def test_heavy_grips_make_the_speed_of_a_crack_that_of_the_strip_and_not_of_the_time_step() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -59,6 +60,17 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
             "output": {"fps": 30, "seconds": 0.2, "size": [64, 48]},
         }
     )
+
+
+@pytest.fixture
+def ran(shot: Shot, unplanned: dict[str, Any]) -> dict[str, Any]:
+    """What a run without a plan says, to be changed at will."""
+    return copy.deepcopy(unplanned)
+
+
+@pytest.fixture(scope="module")
+def unplanned(shot: Shot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return run_shot(shot, tmp_path_factory.mktemp("ran") / "out", plan=False)
 
 
 @pytest.fixture
@@ -186,10 +198,11 @@ def test_a_look_takes_every_piece(device: str) -> None:
     assert all(seconds > 0.0 for seconds in found.values())
 
 
-def test_a_crowded_machine_teaches_nothing_slow(shot: Shot, tmp_path: Path) -> None:
-    stored = tmp_path
+def test_a_crowded_machine_teaches_nothing_slow(
+    shot: Shot, tmp_path: Path, ran: dict[str, Any]
+) -> None:
+    stored, values = tmp_path, ran
     plan = plan_shot(shot, model=model())
-    values = run_shot(shot, stored / "out", plan=False)
     for stage in values["stages"]:
         stage["seconds"] = 1e3
     taught = learn(model(), plan, values, "cpu", stored, crowded=True)
@@ -262,9 +275,10 @@ def test_a_time_budget_becomes_cells_and_stays(shot: Shot, stored: Path) -> None
     assert all(stage["resumed"] for stage in again["stages"])
 
 
-def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(shot: Shot, stored: Path) -> None:
-    plan = plan_shot(shot, model=model())
-    values = run_shot(shot, stored / "out", plan=False)
+def test_work_that_was_foreseen_wrongly_is_not_the_models_fault(
+    shot: Shot, stored: Path, ran: dict[str, Any]
+) -> None:
+    plan, values = plan_shot(shot, model=model()), ran
     assert "plan" not in values
     work = actual_work(plan["work"], values)
     assert work["simulate"]["steps"] == values["simulation"]["substeps"]
