@@ -25,15 +25,17 @@ case ${1:-} in
     shift
     exec "$PYTHON" -m pytest tests/docs tests/config/test_shot_docs.py tests/config/test_physgaussian.py "$@" ;;
   "")
+    # two processes of one thread each: most tests are too small for two threads
+    export OMP_NUM_THREADS=1
+    # libraries and tests are compiled once for all processes and kept: by one beside the checks
+    unset PYTHONDONTWRITEBYTECODE
+    export PYTHONPYCACHEPREFIX="$PWD/build/bytecode"
+    "$PYTHON" -m pytest --collect-only -q > /dev/null 2>&1 &
     "$PYTHON" -m ruff check .
     "$PYTHON" -m ruff format --check .
     "$PYTHON" -m mypy
     clang_format --dry-run -Werror
-    # two processes of one thread each: most tests are too small for two threads
-    export OMP_NUM_THREADS=1
-    # what is imported is compiled once for all processes, and tests for the next time
-    unset PYTHONDONTWRITEBYTECODE
-    export PYTHONPYCACHEPREFIX="$PWD/build/bytecode"
+    wait || true # what cannot be collected is said below
     set -- -n 2 --dist loadfile ;;
 esac
 exec "$PYTHON" -m pytest "$@"
