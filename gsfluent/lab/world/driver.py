@@ -302,6 +302,10 @@ class World:
     def affine(self, value: Tensor) -> None:
         self._stepwise("affine").affine = value
 
+    def shift(self, way: Tensor) -> None:
+        """Move the points over the grid by a way [m], [3]; colliders stay. Only in a force."""
+        self._stepwise("position").shift(way)
+
     def kinetic(self, of: Tensor | None = None) -> float:
         """Kinetic energy [J] with the part in the affine velocities, of all points or a mask."""
         scene = self.scene

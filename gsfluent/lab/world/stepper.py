@@ -221,6 +221,10 @@ class Stepper:
         """Time step [s]: the fixed one, or the automatic one of the current state."""
         return automatic_dt(self.scene, self.strain, self.velocity, self.affine)
 
+    def shift(self, way: Tensor) -> None:
+        """Move the points over the grid by a way [m], [3] or [N, 3]."""
+        self.position, self._blocks = self.position + way.to(self.position), None
+
     def advance(self, dt: float) -> None:
         """Advance by one step of ``dt`` seconds."""
         scene, count = self.scene, self.position.shape[0]

@@ -30,6 +30,9 @@ HEAVY = 100.0
 """Factor on the mass of what is held: a step's forces move it before its velocity is set again, so
 that light grips slip by ``sigma dt / (rho width)``, some 1e-3 c."""
 
+PLASTIC = (0.7548776662466927, 0.5698402909980532)
+"""Inverse of the plastic number, the root of x^3 = x + 1, and its square."""
+
 
 def fracture_energy(length: float) -> float:
     """G_c of :func:`stone` [J/m^2]."""
@@ -141,6 +144,7 @@ def open_slowly(
     crossings: float = 18.0,
     compressive: float = COMPRESSIVE,
     surface: str = "cam_clay",
+    grid_moves: int = 0,
 ) -> Crack:
     """Wedge the arms of a notched slab apart, so that a crack runs between them.
 
@@ -158,6 +162,9 @@ def open_slowly(
         compressive: Strength in compression [Pa]. The yield ellipse through it and the tensile
             strength is what matter around a tip holds, which is pulled along two axes.
         surface: Of :func:`stone`.
+        grid_moves: Steps after which the slab lies elsewhere in its cells of the plane, by a
+            sequence of low discrepancy (Roberts 2018), so that no crack keeps to a row of nodes;
+            0: never.
     """
     dx, height, notch = 1.0 / cells, 0.375, 0.25
     material = stone(length, compressive, surface)
@@ -175,7 +182,14 @@ def open_slowly(
     opening = (speed * c * middle[ends].sign()).to(torch.float32)
     normal = up.to(torch.float32)
 
+    golden = torch.tensor([*PLASTIC, 0.0], dtype=torch.float64)
+    lies = torch.zeros(3, dtype=torch.float64)  # in its cells
+
     def wedge(world: World, _dt: float) -> None:
+        if grid_moves and world.steps % grid_moves == 0:
+            there = (world.steps // grid_moves + 1) * golden % 1.0
+            world.shift(dx * (there - lies))
+            lies.copy_(there)
         v = world.velocity.clone()
         change = min(1.0, world.time * c) * opening.to(v) - v[ends] @ normal.to(v)
         v[ends] += change[:, None] * normal.to(v)
