@@ -1,12 +1,13 @@
 """The long tests of the phase-field law, measured and entered into docs/measured/phase_field.md.
 
-    python scripts/study/phase_field/run.py OUT [--processes 8] [--only TEST,...] [--quick]
+    python scripts/study/phase_field/run.py OUT [--processes 8] [--only NAME,...] [--quick]
         [--device cuda]
     python scripts/study/phase_field/run.py OUT --enter
 
 Each job is a process of its own with OMP_NUM_THREADS threads and leaves NAME.json and NAME.npz in
 OUT; what is there is not run again. All jobs take about four hours of one core; on a GPU they take
-minutes. --enter writes the page and its picture from what OUT holds.
+minutes. --only takes how names of jobs begin. --enter writes into the page and its pictures what
+OUT holds; rows that OUT has not stay.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def main() -> int:
     )
     parser.add_argument("out", type=Path, metavar="OUT")
     parser.add_argument("--processes", type=int, default=1, metavar="N")
-    parser.add_argument("--only", default="", metavar="TEST,...", help="tests; default all")
+    parser.add_argument("--only", default="", metavar="NAME,...", help="begins of names of jobs")
     parser.add_argument("--quick", action="store_true", help="one small run of each test")
     parser.add_argument("--enter", action="store_true", help="write the page")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
@@ -100,14 +101,14 @@ def main() -> int:
         torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
         work(next(job for job in known if job.name == args.job), args.out, args.device)
         return 0
-    only = set(filter(None, args.only.split(",")))
-    if wrong := only - {job.test for job in known}:
-        sys.stderr.write(f"run.py: no test {', '.join(sorted(wrong))}\n")
+    only = tuple(filter(None, args.only.split(",")))
+    if wrong := [o for o in only if not any(job.name.startswith(o) for job in known)]:
+        sys.stderr.write(f"run.py: no job {', '.join(wrong)}\n")
         return 2
     chosen = [
         job
         for job in known
-        if (not only or job.test in only) and not (args.out / f"{job.name}.json").is_file()
+        if job.name.startswith(only or "") and not (args.out / f"{job.name}.json").is_file()
     ]
     return 1 if in_parallel(chosen, args) else 0
 

@@ -69,6 +69,9 @@ HEADINGS = {
 """What stands above the tables that the page has not yet."""
 GONE = 1.5
 """Reach of a crack that has crossed the strip [heights]."""
+KEYS = {"strip": 2, "pmma": 2, "cost": 3, "melon": 3}
+"""Cells of a table that say what a row is of, if not the first alone."""
+UNKNOWN = "not run yet"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -317,8 +320,13 @@ PLAN = (  # row, bar, where it is held or measured
 )
 
 
-def plan(found: Mapping[str, Found]) -> str:
-    """Every row of "Tests and bars" of the specification, and what became of it."""
+def plan(found: Mapping[str, Found], whole: bool) -> str:
+    """Every row of "Tests and bars" of the specification, and what became of it.
+
+    Args:
+        found: What the jobs found.
+        whole: With the rows of which nothing was found.
+    """
 
     def of(test: str) -> list[Found]:
         return [f for f in found.values() if f["test"] == test]
@@ -339,7 +347,7 @@ def plan(found: Mapping[str, Found]) -> str:
     balls = of("floor")
     worst = max((max(f["momentum"], f["gained"]) for f in balls), default=math.nan)
     worst = worst if all(f["same"] for f in balls) else math.inf
-    rows.append(("balls, 20 000 steps", "1e-6, same bits", _met(worst, 1e-6, f"{worst:.0e}")))
+    rows.append(("balls, 20 000 steps", "1e-6, same bits", _met(worst, 1e-6, f"{worst:.1e}")))
     melons = [f for f in of("melon") if "first" in f and f["height"] == 0.6]
     means = [
         float(np.mean([f["first"]["pieces"] for f in melons if f["cells"] == cells]))
@@ -347,18 +355,22 @@ def plan(found: Mapping[str, Found]) -> str:
     ]
     off = max(means) / min(means) - 1.0 if len(means) > 2 else math.nan
     rows.append(("melon at 20, 30, 40 cells", "25 %", _met(off, 0.25, f"{100.0 * off:.0f} %")))
+    rows = [row for row in rows if whole or row[2] != UNKNOWN]
     return _table(("row", "bar", "found"), rows)
 
 
 def _met(value: float, bar: float, told: str) -> str:
     """Whether a figure holds its bar, in words."""
     if math.isnan(value):
-        return "not run yet"
+        return UNKNOWN
     return f"{'held' if value <= bar else 'missed'}: {told}"
 
 
 def enter_page(found: Mapping[str, Found], out: Path, page: Path) -> None:
-    """Write every table for which there are figures, and the picture."""
+    """Write every table for which there are figures, and the picture.
+
+    Rows of the page stay that ``found`` has not.
+    """
     text = page.read_text(encoding="utf-8")
 
     def of(test: str) -> list[Found]:
@@ -372,8 +384,10 @@ def enter_page(found: Mapping[str, Found], out: Path, page: Path) -> None:
     }  # fmt: skip
     for test, table in parts.items():
         if rows := of(test):
-            text = enter(text, f"phase_field_{test}", table(rows), HEADINGS.get(test, ""))
-    text = enter(text, "phase_field_plan", plan(found), HEADINGS["plan"])
+            head = HEADINGS.get(test, "")
+            text = enter(text, f"phase_field_{test}", table(rows), head, KEYS.get(test, 1))
+    begun = "<!-- phase_field_plan: begin -->" in text
+    text = enter(text, "phase_field_plan", plan(found, not begun), HEADINGS["plan"], 1)
     for file, shown in PICTURES.items():
         names = []
         for test, word in shown:
