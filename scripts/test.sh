@@ -35,7 +35,7 @@ case ${1:-} in
     "$PYTHON" -m ruff format --check .
     "$PYTHON" -m mypy
     clang_format --dry-run -Werror
-    wait || true # what cannot be collected is said below
+    wait # what cannot be collected is said below
     set -- -n 2 --dist loadfile ;;
 esac
 exec "$PYTHON" -m pytest "$@"

@@ -43,7 +43,9 @@ def merged(old: str, new: str, key: int) -> str:
     order = list(kept)
     at = len(order)
     for row in fresh:
-        at = order.index(row) if row in kept else at
-        order[at : at + (row in kept)] = [row]
+        if row in kept:
+            at = order.index(row)
+        else:
+            order.insert(at, row)
         at += 1
     return "\n".join([*new.splitlines()[:2], *((kept | fresh)[row] for row in order)])

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 GREY = 0.6
 """Colour of a surface that has none."""
+R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of an additive sequence that keeps points of a plane apart (Roberts 2018): the inverse of
+the plastic number, the root of x^3 = x + 1, and its square."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,11 +75,10 @@ def _spread(
     ends = np.cumsum(area)
     steps = (np.arange(count) + rng.random(count)) / count * ends[-1]
     face = np.minimum(np.searchsorted(ends, steps), len(area) - 1)
-    # Within a triangle an additive sequence of two irrational steps keeps points apart
-    # (Roberts 2018, the R2 sequence); folding keeps it inside.
+    # within a triangle points are kept apart; folding keeps them inside
     order = np.arange(count)
-    u = (0.5 + 0.7548776662466927 * order + rng.random()) % 1.0
-    v = (0.5 + 0.5698402909980532 * order + rng.random()) % 1.0
+    u = (0.5 + R2[0] * order + rng.random()) % 1.0
+    v = (0.5 + R2[1] * order + rng.random()) % 1.0
     over = u + v > 1.0
     u[over], v[over] = 1.0 - u[over], 1.0 - v[over]
     weight = np.stack([1.0 - u - v, u, v], axis=1)

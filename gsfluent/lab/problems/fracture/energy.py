@@ -23,15 +23,13 @@ from gsfluent.lab.world.shapes import box, parameters, sheet, wave_speed
 from gsfluent.lab.world.walls import between_planes
 from gsfluent.materials import Material
 from gsfluent.pipeline.matter.brittle import brittle_rows, distinct_rows
+from gsfluent.spatial.mesh_surface import R2
 
 YOUNG, POISSON, DENSITY = 1e9, 0.2, 1000.0
 TENSILE, COMPRESSIVE = 4e6, 4e7
 HEAVY = 100.0
 """Factor on the mass of what is held: a step's forces move it before its velocity is set again, so
 that light grips slip by ``sigma dt / (rho width)``, some 1e-3 c."""
-
-PLASTIC = (0.7548776662466927, 0.5698402909980532)
-"""Inverse of the plastic number, the root of x^3 = x + 1, and its square."""
 
 
 def fracture_energy(length: float) -> float:
@@ -182,14 +180,12 @@ def open_slowly(
     opening = (speed * c * middle[ends].sign()).to(torch.float32)
     normal = up.to(torch.float32)
 
-    golden = torch.tensor([*PLASTIC, 0.0], dtype=torch.float64)
-    lies = torch.zeros(3, dtype=torch.float64)  # in its cells
+    step = torch.tensor([*R2, 0.0], dtype=torch.float64)
 
     def wedge(world: World, _dt: float) -> None:
         if grid_moves and world.steps % grid_moves == 0:
-            there = (world.steps // grid_moves + 1) * golden % 1.0
-            world.shift(dx * (there - lies))
-            lies.copy_(there)
+            moves = world.steps // grid_moves
+            world.shift(dx * ((moves + 1) * step % 1.0 - moves * step % 1.0))
         v = world.velocity.clone()
         change = min(1.0, world.time * c) * opening.to(v) - v[ends] @ normal.to(v)
         v[ends] += change[:, None] * normal.to(v)
